@@ -1,7 +1,8 @@
-"""Execute notebooks and store them with their outputs: ``python notebooks/execute.py [--full] [notebook …]``.
+"""Execute notebooks and store them with their outputs: ``python notebooks/execute.py [--full]
+[notebook …]``.
 
-The metadata keep the hash of the weights that MBIR ran with and the digest of the sources that made what is shown
-(:func:`sources_digest`): tests compare both with what there is now."""
+The metadata keep the hash of the weights that MBIR ran with and the digest of the sources that made
+what is shown (:func:`sources_digest`): tests compare both with what there is now."""
 
 from __future__ import annotations
 
@@ -25,9 +26,22 @@ _MBIR = ("recon/mbir", "recon/gram", "recon/least_squares/inset_problem.py")
 _FBP = ("recon/analytic/fbp.py", "recon/analytic/inset.py", "recon/analytic/ramp.py")
 MADE_BY: dict[str, tuple[str, ...]] = {
     "first_scan.ipynb": (*_PLAQUE, *_FBP, *_MBIR),
-    "fbp_vs_mbir.ipynb": (*_PLAQUE, *_FBP, *_MBIR, "recon/evaluate/measure.py", "recon/evaluate/estimates.py"),
+    "fbp_vs_mbir.ipynb": (
+        *_PLAQUE,
+        *_FBP,
+        *_MBIR,
+        "recon/evaluate/measure.py",
+        "recon/evaluate/estimates.py",
+    ),
     "reading_a_plaque.ipynb": (*_PLAQUE, *_FBP, "recon/plaque"),
-    "train_your_own_prior.ipynb": (*_PLAQUE, *_FBP, *_MBIR, "train/loop.py", "train/objective.py", "train/configs"),
+    "train_your_own_prior.ipynb": (
+        *_PLAQUE,
+        *_FBP,
+        *_MBIR,
+        "train/loop.py",
+        "train/objective.py",
+        "train/configs",
+    ),
     "your_own_data.ipynb": (
         *_FBP,
         "recon/least_squares/pwls.py",
@@ -35,13 +49,14 @@ MADE_BY: dict[str, tuple[str, ...]] = {
         "torchpcct/metrics/half_split.py",
     ),
 }
-"""Files and folders whose change may change what a notebook shows, no more than these: the method that it shows and the
-scan that it shows it on."""
+"""Files and folders whose change may change what a notebook shows, no more than these: the method
+that it shows and the scan that it shows it on."""
 PARAMETER = re.compile(r"^QUICK = (True|False)$", re.MULTILINE)
 
 
 def sources_digest(name: str) -> str:
-    """SHA-256 of the sources of :data:`MADE_BY`, without their comments and docstrings, which show nowhere.
+    """SHA-256 of the sources of :data:`MADE_BY`, without their comments and docstrings, which show
+    nowhere.
 
     Args:
         name: of the notebook.
@@ -49,7 +64,11 @@ def sources_digest(name: str) -> str:
     total = hashlib.sha256()
     for entry in MADE_BY[name]:
         path = ROOT / entry
-        found = [path] if path.is_file() else sorted(f for e in ("*.py", "*.yaml") for f in path.rglob(e))
+        found = (
+            [path]
+            if path.is_file()
+            else sorted(f for e in ("*.py", "*.yaml") for f in path.rglob(e))
+        )
         for file in found:
             text = file.read_text(encoding="utf-8")
             shown = ast.dump(_bare(ast.parse(text))) if file.suffix == ".py" else text
@@ -58,11 +77,16 @@ def sources_digest(name: str) -> str:
 
 
 def _bare(tree: ast.Module) -> ast.Module:
-    """Without the texts that stand alone: docstrings of modules, classes, functions and attributes."""
+    """Without the texts that stand alone: docstrings of modules, classes, functions and
+    attributes."""
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
         if isinstance(body, list):
-            node.body = [n for n in body if not (isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant))]
+            node.body = [
+                n
+                for n in body
+                if not (isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant))
+            ]
     return tree
 
 
@@ -81,9 +105,13 @@ def execute(path: Path, quick: bool, timeout: int = 7200) -> float:
             cell.source, count = PARAMETER.subn(f"QUICK = {quick}", cell.source)
             found += count
     if not quick and not found:
-        raise ValueError(f"{path} has no line QUICK = True in a code cell, so there is no full run of it")
+        raise ValueError(
+            f"{path} has no line QUICK = True in a code cell, so there is no full run of it"
+        )
     folder = {"metadata": {"path": str(path.resolve().parent)}}
-    NotebookClient(notebook, timeout=timeout, kernel_name="python3", resources=folder, record_timing=False).execute()
+    NotebookClient(
+        notebook, timeout=timeout, kernel_name="python3", resources=folder, record_timing=False
+    ).execute()
     # What depends on the machine says nothing to the reader and would change with every run.
     notebook.metadata = {
         "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
@@ -101,9 +129,15 @@ def execute(path: Path, quick: bool, timeout: int = 7200) -> float:
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description="Execute notebooks in place and keep their outputs.")
-    parser.add_argument("notebooks", nargs="*", type=Path, help="files (default: all beside this script)")
-    parser.add_argument("--full", action="store_true", help="all views and more realisations: QUICK = False")
+    parser = argparse.ArgumentParser(
+        description="Execute notebooks in place and keep their outputs."
+    )
+    parser.add_argument(
+        "notebooks", nargs="*", type=Path, help="files (default: all beside this script)"
+    )
+    parser.add_argument(
+        "--full", action="store_true", help="all views and more realisations: QUICK = False"
+    )
     options = parser.parse_args()
     for path in options.notebooks or sorted(HERE.glob("*.ipynb")):
         seconds = execute(path, not options.full)

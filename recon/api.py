@@ -37,13 +37,15 @@ __all__ = ["METHODS", "MethodOptions", "reconstruct", "require_light"]
 
 _LOG = logging.getLogger(__name__)
 
-# More zero counts than this, and the logarithm no longer describes the data: FBP and PWLS would be guesswork.
+# More zero counts than this, and the logarithm no longer describes the data: FBP and PWLS would be
+# guesswork.
 _STARVED = 0.5
 
 
 class MethodOptions(PwlsOptions, total=False):
-    """Options of :func:`reconstruct`: ``kernel`` of FBP, ``prior``, ``problem`` and ``batch`` of PWLS and MBIR, the
-    rest of MBIR. Each is described where its method is; that of another method is a ``TypeError``."""
+    """Options of :func:`reconstruct`: ``kernel`` of FBP, ``prior``, ``problem`` and ``batch`` of
+    PWLS and MBIR, the rest of MBIR. Each is described where its method is; that of another method
+    is a ``TypeError``."""
 
     kernel: str
     prior: QGGMRF | Prior | str | None
@@ -64,21 +66,32 @@ def require_light(zero_fraction: float) -> None:
     """Refuse a scan of which more than half the readings are zero (ValueError)."""
     if zero_fraction > _STARVED:
         raise ValueError(
-            f"{100 * zero_fraction:.0f} % of the readings are zero: too few photons for a line-integral method; "
+            f"{100 * zero_fraction:.0f} % of the readings are zero: too few photons for a "
+            "line-integral method; "
             "raise the exposure or bin the readings"
         )
 
 
 @overload
 def reconstruct(
-    scan: Scan, grid: VolumeGrid, method: str = ..., *, progress: Callable[[float], None] | None = ...,
-    device: str | torch.device = ..., **options: Unpack[MethodOptions],
-) -> Volume: ...  # fmt: skip
+    scan: Scan,
+    grid: VolumeGrid,
+    method: str = ...,
+    *,
+    progress: Callable[[float], None] | None = ...,
+    device: str | torch.device = ...,
+    **options: Unpack[MethodOptions],
+) -> Volume: ...
 @overload
 def reconstruct(
-    scan: Sequence[Scan], grid: VolumeGrid, method: str = ..., *, progress: Callable[[float], None] | None = ...,
-    device: str | torch.device = ..., **options: Unpack[MethodOptions],
-) -> list[Volume]: ...  # fmt: skip
+    scan: Sequence[Scan],
+    grid: VolumeGrid,
+    method: str = ...,
+    *,
+    progress: Callable[[float], None] | None = ...,
+    device: str | torch.device = ...,
+    **options: Unpack[MethodOptions],
+) -> list[Volume]: ...
 
 
 @checked
@@ -95,52 +108,64 @@ def reconstruct(
 
     Args:
         scan: one scan, or several realisations of one scan (same geometry, window and exposure).
-        grid: ``(z, y, x)`` grid inside the field of view; of a parallel or fan-beam scan ``(y, x)`` or, of several
-            slices, ``(slices, y, x)``.
-        method: ``"fbp"`` (FDK; option ``kernel``) or ``"pwls"`` (penalised weighted least squares with a q-GGMRF
-            prior, of an inset or a whole field; options of :func:`recon.least_squares.reconstruct.reconstruct_pwls`;
-            a volume that did not converge carries ``warnings`` in its report) or ``"mbir"`` (unrolled steps with the
-            learned prior that ships with the package, of an inset or a whole field; options of
-            :func:`recon.mbir.reconstruct.reconstruct_mbir`; what the training has not seen is named in ``warnings``).
-            Options may follow, as an evaluation has them (:mod:`recon.evaluate.methods`): ``"fbp:soft"``,
+        grid: ``(z, y, x)`` grid inside the field of view; of a parallel or fan-beam scan ``(y, x)``
+            or, of several slices, ``(slices, y, x)``.
+        method: ``"fbp"`` (FDK; option ``kernel``) or ``"pwls"`` (penalised weighted least squares
+            with a q-GGMRF prior, of an inset or a whole field; options of
+            :func:`recon.least_squares.reconstruct.reconstruct_pwls`; a volume that did not converge
+            carries ``warnings`` in its report) or ``"mbir"`` (unrolled steps with the learned prior
+            that ships with the package, of an inset or a whole field; options of
+            :func:`recon.mbir.reconstruct.reconstruct_mbir`; what the training has not seen is named
+            in ``warnings``). Options may follow, as an evaluation has them
+            (:mod:`recon.evaluate.methods`): ``"fbp:soft"``,
             ``"mbir:fidelity=1,prior=perona-malik"``.
         progress: called with the finished fraction, 0…1.
         device: where the returned volumes lie.
         options: of the method (:class:`MethodOptions`).
 
-    Readings that no object can cause (dead or hot cells, dead views, lost readings: :mod:`torchpcct.checks.defects`)
-    are interpolated before; the report's ``warnings`` say so, and what else the readings say against their description
-    (an offset, saturation, transmissions, no light: :mod:`torchpcct.checks.readings`). Scans that contradict themselves
-    or their description (centre, fan angles, steps between views, roll, rows that end inside the object, readings that
-    are no line integrals) are named there, too (:func:`recon.analytic.coverage.consistency_warnings`); PWLS and MBIR
-    test what they leave of the data besides. Metal is named (:mod:`recon.metal`), not corrected.
+    Readings that no object can cause (dead or hot cells, dead views, lost readings:
+    :mod:`torchpcct.checks.defects`) are interpolated before; the report's ``warnings`` say so, and
+    what else the readings say against their description (an offset, saturation, transmissions, no
+    light: :mod:`torchpcct.checks.readings`). Scans that contradict themselves or their description
+    (centre, fan angles, steps between views, roll, rows that end inside the object, readings that
+    are no line integrals) are named there, too
+    (:func:`recon.analytic.coverage.consistency_warnings`); PWLS and MBIR test what they leave of
+    the data besides. Metal is named (:mod:`recon.metal`), not corrected.
 
-    The number of threads does not change a bit of an inset's FBP and PWLS. FBP of whole rows and MBIR, where torch's
-    matrix products and convolutions decide about the order of sums, agree within 0.01 HU.
+    The number of threads does not change a bit of an inset's FBP and PWLS. FBP of whole rows and
+    MBIR, where torch's matrix products and convolutions decide about the order of sums, agree
+    within 0.01 HU.
 
     Returns:
-        A :class:`torchpcct.Volume` (a list of them for a sequence of scans), float32 HU; its ``report`` says how it was
-        made: method, options, seconds, ``warnings``, how many ``dead_readings`` were bridged, ``cells_mm`` of the
-        detector as they are seen at the axis ([z,] y, x), and for iterative methods iterations and residual. In mm⁻¹ if
-        ``scan.unit`` says so.
+        A :class:`torchpcct.Volume` (a list of them for a sequence of scans), float32 HU; its
+        ``report`` says how it was
+        made: method, options, seconds, ``warnings``, how many ``dead_readings`` were bridged,
+            ``cells_mm`` of the
+        detector as they are seen at the axis ([z,] y, x), and for iterative methods iterations and
+        residual. In mm⁻¹ if ``scan.unit`` says so.
 
     Raises:
-        ValueError: an unknown method, kernel or option value, a grid outside the field of view, a starved scan.
+        ValueError: an unknown method, kernel or option value, a grid outside the field of view, a
+            starved scan.
         TypeError: ``scan`` is no :class:`torchpcct.Scan`, or an option does not exist.
 
     Example:
         >>> import numpy as np, torch
         >>> from torchpcct import ParallelBeam, Projector, Scan, VolumeGrid
-        >>> geometry, grid = ParallelBeam(np.arange(60) * np.pi / 60, 48, 1.0), VolumeGrid((32, 32), 1.0)
+        >>> geometry = ParallelBeam(np.arange(60) * np.pi / 60, 48, 1.0)
+        >>> grid = VolumeGrid((32, 32), 1.0)
         >>> water = torch.zeros(grid.shape).index_put([torch.tensor([16])], torch.tensor(0.02))
-        >>> scan = Scan.from_line_integrals(Projector(geometry, grid)(water), geometry, photons=1e6, mu_water=0.02)
+        >>> lines = Projector(geometry, grid)(water)
+        >>> scan = Scan.from_line_integrals(lines, geometry, photons=1e6, mu_water=0.02)
         >>> volume = reconstruct(scan, grid, "fbp", kernel="soft")
         >>> volume.data.shape, volume.unit, volume.report["kernel"]
         (torch.Size([32, 32]), 'HU', 'soft')
     """
     scans = [scan] if isinstance(scan, Scan) else list(scan) if isinstance(scan, Sequence) else []
     if not scans or not all(isinstance(s, Scan) for s in scans):
-        raise TypeError(f"scan must be a Scan or a non-empty sequence of scans, got {type(scan).__name__}")
+        raise TypeError(
+            f"scan must be a Scan or a non-empty sequence of scans, got {type(scan).__name__}"
+        )
     if not isinstance(grid, VolumeGrid) or (grid.ndim != 3 and scans[0].geometry.has_rows):
         raise ValueError(f"grid must be a (z, y, x) VolumeGrid, got {grid!r}")
     for s in scans:
@@ -148,12 +173,17 @@ def reconstruct(
     name, named = split_method(method)
     twice = sorted(named.keys() & options.keys())
     if twice:
-        raise TypeError(f"{', '.join(twice)} stands in the method {method!r} and beside it: leave out one of them")
+        raise TypeError(
+            f"{', '.join(twice)} stands in the method {method!r} and beside it: leave out one of "
+            "them"
+        )
     if "weights" in named:
         from recon.mbir.mbir import Mbir
 
         if "network" in options:
-            raise TypeError(f"network stands beside the weights of the method {method!r}: leave out one of them")
+            raise TypeError(
+                f"network stands beside the weights of the method {method!r}: leave out one of them"
+            )
         named["network"] = Mbir.load(named.pop("weights"), network=named.pop("network", None))
     chosen: dict[str, Any] = {**named, **options}
     whole = [(s, [*texts, *reading_warnings(s)]) for s, texts in map(repair_defects, scans)]
@@ -169,7 +199,11 @@ def reconstruct(
         for solution in batch:
             s, before = whole[len(volumes)]
             volume, report, found = _finished(s, grid, solution)
-            report |= {"seconds": seconds, "cells_mm": finite_cells(s.geometry), "dead_readings": dead_readings(s)}
+            report |= {
+                "seconds": seconds,
+                "cells_mm": finite_cells(s.geometry),
+                "dead_readings": dead_readings(s),
+            }
             report["warnings"] = [*before, *found]
             for text in found:
                 if text not in told:
@@ -180,29 +214,47 @@ def reconstruct(
     return volumes[0] if isinstance(scan, Scan) else volumes
 
 
-def _finished(scan: Scan, grid: VolumeGrid, solution: Solution) -> tuple[Tensor, dict[str, Any], list[str]]:
-    """The volume in the scan's unit, the report with what the tests of the data say, and all warnings."""
+def _finished(
+    scan: Scan, grid: VolumeGrid, solution: Solution
+) -> tuple[Tensor, dict[str, Any], list[str]]:
+    """The volume in the scan's unit, the report with what the tests of the data say, and all
+    warnings."""
     values, report, tests = solution.volume.to(torch.float32), dict(solution.report), solution.tests
     if tests:
         report.setdefault("chi2", sum(t.chi2 for t in tests) / len(tests))
-        report["residual_p"] = {n: min(t.p_values.get(n, 1.0) for t in tests) for n in tests[0].p_values}
+        report["residual_p"] = {
+            n: min(t.p_values.get(n, 1.0) for t in tests) for n in tests[0].p_values
+        }
     failed: list[str] = []
-    consistency = tested("the test of the scan against its description", failed, consistency_warnings, scan, grid)
+    consistency = tested(
+        "the test of the scan against its description", failed, consistency_warnings, scan, grid
+    )
     found = [text for texts in consistency for text in texts]
     found += [*solution.warnings, *(text for t in tests for text in t.findings)]
     # MBIR says itself what lies beyond its training.
     if report["method"] != "mbir" and scan.unit == "HU":
-        found += [text for texts in tested("the search for metal", failed, metal_warnings, values) for text in texts]
+        found += [
+            text
+            for texts in tested("the search for metal", failed, metal_warnings, values)
+            for text in texts
+        ]
     found += failed
     data = values if scan.unit == "HU" else from_hu(values, scan.linearisation.mu_ref)
     return data, report, list(dict.fromkeys(found))
 
 
 def _fbp(
-    scans: Sequence[Scan], grid: VolumeGrid, progress: Callable[[float], None], *, kernel: str = "standard"
+    scans: Sequence[Scan],
+    grid: VolumeGrid,
+    progress: Callable[[float], None],
+    *,
+    kernel: str = "standard",
 ) -> Iterator[list[Solution]]:
     if not isinstance(kernel, str):
-        raise TypeError(f"kernel must be one name, got {kernel!r}; recon.analytic.inset.InsetFbp takes several at once")
+        raise TypeError(
+            f"kernel must be one name, got {kernel!r}; recon.analytic.inset.InsetFbp takes "
+            "several at once"
+        )
     run = InsetFbp(scans[0], [grid], [kernel])
     warnings, notes = [*run.warnings, *sampling_warnings(run.circle)], view_notes(run.circle)
     report = {"method": "fbp", "kernel": kernel, **({"notes": notes} if notes else {})}

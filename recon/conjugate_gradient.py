@@ -1,9 +1,10 @@
 """Conjugate gradients, the method by which everything quadratic in this package is solved.
 
-:func:`conjugate_gradient` is the linear one. The nonlinear ones of PWLS (:mod:`recon.least_squares.model_solver`
-inside, :mod:`recon.least_squares.pwls` outside) share :func:`dot` and :func:`per_volume` with it, not the recursion:
-their gradient is computed afresh in every step, their step length is searched for, and the next direction needs both
-gradients (Polak–Ribière) or the exact curvature.
+:func:`conjugate_gradient` is the linear one. The nonlinear ones of PWLS
+(:mod:`recon.least_squares.model_solver` inside, :mod:`recon.least_squares.pwls` outside) share
+:func:`dot` and :func:`per_volume` with it, not the recursion: their gradient is computed afresh in
+every step, their step length is searched for, and the next direction needs both gradients
+(Polak–Ribière) or the exact curvature.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ def dot(a: Tensor, b: Tensor, axes: int) -> Tensor:
 
 
 def per_volume(factor: Tensor, like: Tensor) -> Tensor:
-    """One factor for every volume, ``(batch,)``, in the dtype of the volumes ``(batch, …)``, ready to multiply them."""
+    """One factor for every volume, ``(batch,)``, in the dtype of the volumes ``(batch, …)``,
+    ready to multiply them."""
     return factor.to(like.dtype).reshape(-1, *[1] * (like.dim() - 1))
 
 
@@ -41,8 +43,8 @@ def conjugate_gradient(
         right: ``(batch, ...)``.
         precondition: about H⁻¹, symmetric and positive definite.
         iterations: largest number of them.
-        tolerance: stop when the norm of the residual, in the metric of the preconditioner, has fallen by this factor
-            for all.
+        tolerance: stop when the norm of the residual, in the metric of the preconditioner, has
+            fallen by this factor for all.
 
     Returns:
         x like ``right``.

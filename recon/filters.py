@@ -1,18 +1,22 @@
 """Edge-preserving filters of a finished volume: tools, and what a reconstruction has to beat.
 
-Each is called as ``filter(volume, noise_hu, **settings)`` with a volume ``(z, y, x)`` of FBP or PWLS in HU, on cubic
-voxels, and gives one of the same shape, dtype and kind (tensor or array). Lengths are in voxels. ``noise_hu`` is the
-standard deviation of flat tissue that the filter's threshold refers to, as :func:`flat_noise` measures it:
+Each is called as ``filter(volume, noise_hu, **settings)`` with a volume ``(z, y, x)`` of FBP or
+PWLS in HU, on cubic voxels, and gives one of the same shape, dtype and kind (tensor or array).
+Lengths are in voxels. ``noise_hu`` is the standard deviation of flat tissue that the filter's
+threshold refers to, as :func:`flat_noise` measures it:
 
-* of the volume itself for :func:`gaussian` (which ignores it), :func:`nlm`, :func:`tv` and :func:`bm4d`;
-* of the volume that the edges are looked for in, smoothed by ``sigma`` voxels, for :func:`perona_malik` and
-  :func:`bilateral`. CT noise is correlated, and after smoothing by a given width its level depends on the kernel.
+* of the volume itself for :func:`gaussian` (which ignores it), :func:`nlm`, :func:`tv` and
+  :func:`bm4d`;
+* of the volume that the edges are looked for in, smoothed by ``sigma`` voxels, for
+  :func:`perona_malik` and :func:`bilateral`. CT noise is correlated, and after smoothing by a given
+  width its level depends on the kernel.
 
-:func:`denoised` measures that level in a flat region and calls a filter by its name. Constants pass through all of
-them, a constant that is added to a volume is added to the result, and twice the volume with twice the noise gives twice
-the result; so none has a zero that it shrinks towards. What they take away with the noise is the contrast of small weak
-things: judge them by contrast and its slope, too, not by smoothness alone (:mod:`recon.evaluate.rivals` has settings
-that were tuned). In the place of MBIR's network: :mod:`recon.mbir.priors`.
+:func:`denoised` measures that level in a flat region and calls a filter by its name. Constants pass
+through all of them, a constant that is added to a volume is added to the result, and twice the
+volume with twice the noise gives twice the result; so none has a zero that it shrinks towards. What
+they take away with the noise is the contrast of small weak things: judge them by contrast and its
+slope, too, not by smoothness alone (:mod:`recon.evaluate.rivals` has settings that were tuned). In
+the place of MBIR's network: :mod:`recon.mbir.priors`.
 """
 
 from __future__ import annotations
@@ -73,18 +77,26 @@ def gaussian(volume: Image, noise_hu: float = 0.0, *, sigma: float = 1.0) -> Ima
 
 @checked
 def perona_malik(
-    volume: Image, noise_hu: float, *, sigma: float = 0.7, edge: float = 1.3, steps: int = 15, rate: float = 1 / 7
+    volume: Image,
+    noise_hu: float,
+    *,
+    sigma: float = 0.7,
+    edge: float = 1.3,
+    steps: int = 15,
+    rate: float = 1 / 7,
 ) -> Image:
-    """Regularised anisotropic diffusion in 3-D (Catté, Lions, Morel, Coll 1992, SIAM J. Numer. Anal. 29:182).
+    """Regularised anisotropic diffusion in 3-D (Catté, Lions, Morel, Coll 1992, SIAM J. Numer.
+    Anal. 29:182).
 
-    ``steps`` times u ← u + rate Σ (u_q − u) exp(−((Gu_q − Gu) / (edge · noise_hu))²) over the six neighbours q, with a
-    Gaussian G: voxels are mixed with neighbours from which they differ by no more than noise, once it is smoothed. The
-    mean of the volume stays what it was.
+    ``steps`` times u ← u + rate Σ (u_q − u) exp(−((Gu_q − Gu) / (edge · noise_hu))²) over the six
+    neighbours q, with a Gaussian G: voxels are mixed with neighbours from which they differ by no
+    more than noise, once it is smoothed. The mean of the volume stays what it was.
 
     Args:
         volume: ``(z, y, x)`` HU.
         noise_hu: standard deviation in flat tissue of the volume smoothed by ``sigma``.
-        sigma: of G in voxels; 0 is the filter of Perona and Malik 1990, which takes noise for edges.
+        sigma: of G in voxels; 0 is the filter of Perona and Malik 1990, which takes noise for
+            edges.
         edge: differences beyond ``edge · noise_hu`` are kept.
         steps: more smooth farther.
         rate: of a step, at most 1/6, where it stays stable.
@@ -94,7 +106,10 @@ def perona_malik(
     """
     u, back = _opened(volume)
     scale = _noise(noise_hu) * number("edge", edge, positive=True)
-    sigma, rate = number("sigma", sigma, low=0.0, unit="voxels"), number("rate", rate, low=0.0, high=1 / 6)
+    sigma, rate = (
+        number("sigma", sigma, low=0.0, unit="voxels"),
+        number("rate", rate, low=0.0, high=1 / 6),
+    )
     for _ in range(whole("steps", steps, low=0)):
         guide, change = _smoothed(u, sigma), torch.zeros_like(u)
         for axis in range(3):
@@ -109,12 +124,16 @@ def perona_malik(
 
 
 @checked
-def bilateral(volume: Image, noise_hu: float, *, sigma: float = 1.4, edge: float = 2.0, reach: float = 2.5) -> Image:
-    """Joint bilateral filter in 3-D: a mean over the neighbourhood of what looks alike in the smoothed volume.
+def bilateral(
+    volume: Image, noise_hu: float, *, sigma: float = 1.4, edge: float = 2.0, reach: float = 2.5
+) -> Image:
+    """Joint bilateral filter in 3-D: a mean over the neighbourhood of what looks alike in the
+    smoothed volume.
 
-    Weights are exp(−d² / (2 reach²) − ((Gu_q − Gu) / (edge · noise_hu))² / 2) at the distance d (Tomasi, Manduchi 1998,
-    ICCV; guided by the volume's own smooth version, as Petschnigg et al. 2004, ACM Trans. Graph. 23:664, by another).
-    The defaults have the least error in vessels of any direction on 0.2 mm voxels of FBP with the detail kernel.
+    Weights are exp(−d² / (2 reach²) − ((Gu_q − Gu) / (edge · noise_hu))² / 2) at the distance d
+    (Tomasi, Manduchi 1998, ICCV; guided by the volume's own smooth version, as Petschnigg et al.
+    2004, ACM Trans. Graph. 23:664, by another). The defaults have the least error in vessels of any
+    direction on 0.2 mm voxels of FBP with the detail kernel.
 
     Args:
         volume: ``(z, y, x)`` HU.
@@ -148,12 +167,20 @@ def bilateral(volume: Image, noise_hu: float, *, sigma: float = 1.4, edge: float
 
 @checked
 def nlm(
-    volume: Image, noise_hu: float, *, strength: float = 0.6, patch: int = 1, search: int = 4, told: float = 1.0
+    volume: Image,
+    noise_hu: float,
+    *,
+    strength: float = 0.6,
+    patch: int = 1,
+    search: int = 4,
+    told: float = 1.0,
 ) -> Image:
-    """Non-local means in 3-D: a mean over voxels whose surrounds are alike (Buades, Coll, Morel 2005, CVPR).
+    """Non-local means in 3-D: a mean over voxels whose surrounds are alike (Buades, Coll, Morel
+    2005, CVPR).
 
-    Weights are exp(−max(D² − 2 told² noise², 0) / (strength · noise)²), D² the mean squared difference of two cubes.
-    (scikit-image's fast mode compares cubes that are not centred: there a mirrored volume gives another result.)
+    Weights are exp(−max(D² − 2 told² noise², 0) / (strength · noise)²), D² the mean squared
+    difference of two cubes. (scikit-image's fast mode compares cubes that are not centred: there a
+    mirrored volume gives another result.)
 
     Args:
         volume: ``(z, y, x)`` HU.
@@ -178,8 +205,13 @@ def nlm(
         other = _window(wide, offset, middle.shape)
         unlike = (other - middle).square_()
         for axis, n in enumerate(u.shape):
-            unlike = sum((unlike.narrow(axis, k, n) for k in range(1, 2 * patch + 1)), unlike.narrow(axis, 0, n))
-        weight = unlike.div_((2 * patch + 1) ** 3).sub_(expected).clamp_(min=0.0).div_(-(h**2)).exp_()
+            unlike = sum(
+                (unlike.narrow(axis, k, n) for k in range(1, 2 * patch + 1)),
+                unlike.narrow(axis, 0, n),
+            )
+        weight = (
+            unlike.div_((2 * patch + 1) ** 3).sub_(expected).clamp_(min=0.0).div_(-(h**2)).exp_()
+        )
         total.add_(weight)
         sums.addcmul_(weight, _window(other, (patch,) * 3, u.shape) - u)
     return back(u + sums / total)
@@ -187,13 +219,14 @@ def nlm(
 
 @checked
 def tv(volume: Image, noise_hu: float, *, strength: float = 1.0, steps: int = 100) -> Image:
-    """Total variation in 3-D (Rudin, Osher, Fatemi 1992, Physica D 60:259), solved by scikit-image (Chambolle 2004).
+    """Total variation in 3-D (Rudin, Osher, Fatemi 1992, Physica D 60:259), solved by scikit-image
+    (Chambolle 2004).
 
     Args:
         volume: ``(z, y, x)`` HU.
         noise_hu: standard deviation in flat tissue.
-        strength: ``strength · noise_hu`` is the weight of the total variation against half of the squared distance to
-            the volume.
+        strength: ``strength · noise_hu`` is the weight of the total variation against half of the
+            squared distance to the volume.
         steps: of the solver.
 
     Raises:
@@ -204,30 +237,35 @@ def tv(volume: Image, noise_hu: float, *, strength: float = 1.0, steps: int = 10
     u, back = _opened(volume)
     weight = number("strength", strength, positive=True) * _noise(noise_hu)
     level = float(u.mean())
-    found = denoise_tv_chambolle(_array(u - level), weight=weight, eps=1e-6, max_num_iter=whole("steps", steps))
+    found = denoise_tv_chambolle(
+        _array(u - level), weight=weight, eps=1e-6, max_num_iter=whole("steps", steps)
+    )
     return back(torch.from_numpy(np.ascontiguousarray(found)).to(u) + level)
 
 
 @checked
-def bm4d(volume: Image, noise_hu: float, *, strength: float = 1.0, covariance: ArrayLike | None = None) -> Image:
-    """BM4D: collaborative filtering of groups of like blocks, for correlated noise (Mäkinen, Azzari, Foi 2020, IEEE
-    Trans. Image Process. 29:8339; Maggioni et al. 2013).
+def bm4d(
+    volume: Image, noise_hu: float, *, strength: float = 1.0, covariance: ArrayLike | None = None
+) -> Image:
+    """BM4D: collaborative filtering of groups of like blocks, for correlated noise (Mäkinen,
+    Azzari, Foi 2020, IEEE Trans. Image Process. 29:8339; Maggioni et al. 2013).
 
-    It needs the package ``bm4d`` of Tampere University (extra ``rivals``), whose licence allows NON-COMMERCIAL use
-    only; nothing of it is part of this package.
+    It needs the package ``bm4d`` of Tampere University (extra ``rivals``), whose licence allows
+    NON-COMMERCIAL use only; nothing of it is part of this package.
 
     Args:
         volume: ``(z, y, x)`` HU.
         noise_hu: standard deviation in flat tissue.
         strength: factor on the noise that it is told.
-        covariance: of a voxel's noise with those around it, HU² or any multiple of it, the voxel itself in the middle;
-            odd numbers of voxels, at most the volume's (:func:`recon.analytic.exact_noise.voxel_covariance` gives
-            FBP's). None: white noise.
+        covariance: of a voxel's noise with those around it, HU² or any multiple of it, the voxel
+            itself in the middle; odd numbers of voxels, at most the volume's
+            (:func:`recon.analytic.exact_noise.voxel_covariance` gives FBP's). None: white noise.
 
     Raises:
-        ImportError: the package is not installed, or does not run with this NumPy (4.2.5 needs less than 2.4).
-        ValueError, TypeError: a volume that is not 3-D, real and finite; a setting out of range; a covariance of
-            another kind.
+        ImportError: the package is not installed, or does not run with this NumPy (4.2.5 needs less
+            than 2.4).
+        ValueError, TypeError: a volume that is not 3-D, real and finite; a setting out of range; a
+            covariance of another kind.
     """
     u, back = _opened(volume)
     noise = _noise(noise_hu) * number("strength", strength, positive=True)
@@ -235,7 +273,8 @@ def bm4d(volume: Image, noise_hu: float, *, strength: float = 1.0, covariance: A
         package = importlib.import_module("bm4d")
     except ImportError:
         raise ImportError(
-            'BM4D needs its authors\' package: pip install "torchpcct[rivals]" (its licence allows non-commercial use '
+            'BM4D needs its authors\' package: pip install "torchpcct[rivals]" (its licence '
+            "allows non-commercial use "
             "only), or use another filter"
         ) from None
     level = float(u.mean())
@@ -244,17 +283,25 @@ def bm4d(volume: Image, noise_hu: float, *, strength: float = 1.0, covariance: A
         found = np.asarray(package.bm4d(_array(u - level).astype(np.float64), told))
     except AttributeError as error:
         # Release 4.2.5 calls a function that NumPy 2.4 has dropped.
-        raise ImportError(f"this release of bm4d does not run with NumPy {np.__version__} ({error})") from error
+        raise ImportError(
+            f"this release of bm4d does not run with NumPy {np.__version__} ({error})"
+        ) from error
     return back(torch.from_numpy(found.reshape(u.shape)).to(u) + level)
 
 
 FILTERS: dict[str, Callable[..., Any]] = {
-    "gaussian": gaussian, "perona_malik": perona_malik, "bilateral": bilateral, "nlm": nlm, "tv": tv, "bm4d": bm4d,
-}  # fmt: skip
+    "gaussian": gaussian,
+    "perona_malik": perona_malik,
+    "bilateral": bilateral,
+    "nlm": nlm,
+    "tv": tv,
+    "bm4d": bm4d,
+}
 """By name."""
 
 SMOOTHED_BY: Mapping[str, float] = {"perona_malik": 0.7, "bilateral": 1.4}
-"""Filters whose ``noise_hu`` is that of the volume smoothed by ``sigma``, with the default of that."""
+"""Filters whose ``noise_hu`` is that of the volume smoothed by ``sigma``, with the default of
+that."""
 
 
 @checked
@@ -264,12 +311,13 @@ def denoised(name: str, volume: Image, flat: Any, **settings: Any) -> Image:
     Args:
         name: of :data:`FILTERS`.
         volume: ``(z, y, x)`` HU.
-        flat: bool mask of its shape, True in flat tissue: some hundred voxels or more of one tissue, clear of edges.
+        flat: bool mask of its shape, True in flat tissue: some hundred voxels or more of one
+            tissue, clear of edges.
         settings: of the filter.
 
     Raises:
-        ValueError, TypeError: an unknown name, a mask of another shape or of fewer than 8 voxels, no noise in the
-            region, and what the filter refuses.
+        ValueError, TypeError: an unknown name, a mask of another shape or of fewer than 8 voxels,
+            no noise in the region, and what the filter refuses.
     """
     run = FILTERS[choice("filter", name, FILTERS)]
     sigma = settings.get("sigma", SMOOTHED_BY[name]) if name in SMOOTHED_BY else 0.0
@@ -278,7 +326,8 @@ def denoised(name: str, volume: Image, flat: Any, **settings: Any) -> Image:
 
 @checked
 def flat_noise(volume: Image, flat: Any, *, sigma: float = 0.0) -> float:
-    """Standard deviation in HU of a region that is flat in truth, of the volume smoothed by ``sigma`` voxels.
+    """Standard deviation in HU of a region that is flat in truth, of the volume smoothed by
+    ``sigma`` voxels.
 
     Args:
         volume: ``(z, y, x)`` HU.
@@ -292,26 +341,36 @@ def flat_noise(volume: Image, flat: Any, *, sigma: float = 0.0) -> float:
     mask = torch.as_tensor(flat, device=u.device)
     if mask.dtype != torch.bool or mask.shape != u.shape:
         raise ValueError(
-            f"flat must be a bool mask of the volume's shape {tuple(u.shape)}, got {tuple(mask.shape)} {mask.dtype}"
+            f"flat must be a bool mask of the volume's shape {tuple(u.shape)}, got "
+            f"{tuple(mask.shape)} {mask.dtype}"
         )
     if int(mask.sum()) < 8:
-        raise ValueError(f"the flat region has {int(mask.sum())} voxels: 8 are the least, some hundred are good")
+        raise ValueError(
+            f"the flat region has {int(mask.sum())} voxels: 8 are the least, some hundred are good"
+        )
     found = float(_smoothed(u, number("sigma", sigma, low=0.0, unit="voxels"))[mask].double().std())
     if found <= 0:
-        raise ValueError("the flat region has no noise at all: give a region inside the object, or noise_hu yourself")
+        raise ValueError(
+            "the flat region has no noise at all: give a region inside the object, or noise_hu "
+            "yourself"
+        )
     return found
 
 
 def denoiser_of(function: Callable[..., Any]) -> Callable[[Tensor, Callable[[], float]], Any]:
-    """A user's denoiser in the form ``(volume, noise)``: ``noise()`` gives the noise in HU, where it is asked for.
+    """A user's denoiser in the form ``(volume, noise)``: ``noise()`` gives the noise in HU, where
+    it is asked for.
 
     Args:
-        function: of ``(volume)`` or ``(volume, sigma)``: HU ``(z, y, x)`` float32, and the standard deviation of a
-            voxel's noise in HU; it gives the same shape. Or a denoiser of deepinv itself, whose images have axes for
-            batch and channel: that becomes :func:`deepinv_denoiser`, of slices unless it convolves in 3-D.
+        function: of ``(volume)`` or ``(volume, sigma)``: HU ``(z, y, x)`` float32, and the standard
+            deviation of a voxel's noise in HU; it gives the same shape. Or a denoiser of deepinv
+            itself, whose images have axes for batch and channel: that becomes
+            :func:`deepinv_denoiser`, of slices unless it convolves in 3-D.
     """
     if any(kind.__module__.partition(".")[0] == "deepinv" for kind in type(function).__mro__):
-        whole_volumes = isinstance(function, nn.Module) and any(isinstance(m, nn.Conv3d) for m in function.modules())
+        whole_volumes = isinstance(function, nn.Module) and any(
+            isinstance(m, nn.Conv3d) for m in function.modules()
+        )
         function = deepinv_denoiser(function, slices=not whole_volumes)
     if len(places_of(function)) > 1:
         return lambda volume, noise: function(volume, noise())
@@ -321,7 +380,9 @@ def denoiser_of(function: Callable[..., Any]) -> Callable[[Tensor, Callable[[], 
 def places_of(function: Callable[..., Any]) -> list[inspect.Parameter]:
     """Arguments of a function, or of a module's ``forward``, that may be given by place."""
     try:
-        signature = inspect.signature(function.forward if isinstance(function, nn.Module) else function)
+        signature = inspect.signature(
+            function.forward if isinstance(function, nn.Module) else function
+        )
     except (TypeError, ValueError):  # of a compiled function that does not tell: it gets a volume
         return []
     named = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
@@ -329,8 +390,11 @@ def places_of(function: Callable[..., Any]) -> list[inspect.Parameter]:
 
 
 @checked
-def deepinv_denoiser(model: Callable[..., Any], *, unit_hu: float = 1000.0, slices: bool = False) -> Any:
-    """A denoiser of deepinv (``model(x, sigma)`` of images with batch and channel) as :func:`denoiser_of` takes it.
+def deepinv_denoiser(
+    model: Callable[..., Any], *, unit_hu: float = 1000.0, slices: bool = False
+) -> Any:
+    """A denoiser of deepinv (``model(x, sigma)`` of images with batch and channel) as
+    :func:`denoiser_of` takes it.
 
     Args:
         model: of images whose values are about 0 … 1.
@@ -350,20 +414,26 @@ def deepinv_denoiser(model: Callable[..., Any], *, unit_hu: float = 1000.0, slic
 
 
 def _opened(volume: Image) -> tuple[Tensor, Callable[[Tensor], Image]]:
-    """The volume as a floating tensor without gradient, and the way back to its own kind and dtype."""
+    """The volume as a floating tensor without gradient, and the way back to its own kind and
+    dtype."""
     if isinstance(volume, Tensor):
         u = volume.detach()
     elif isinstance(volume, np.ndarray) and volume.dtype.kind in "fiu":
-        u = torch.from_numpy(np.ascontiguousarray(volume, dtype=np.result_type(volume.dtype, np.float32)))
+        u = torch.from_numpy(
+            np.ascontiguousarray(volume, dtype=np.result_type(volume.dtype, np.float32))
+        )
     else:
         kind = getattr(volume, "dtype", type(volume).__name__)
         raise TypeError(
-            f"volume must be a real tensor or array (z, y, x) in HU, got {kind}: of a Volume take its .data"
+            f"volume must be a real tensor or array (z, y, x) in HU, got {kind}: of a Volume take "
+            "its .data"
         )
     if u.is_complex() or u.dtype == torch.bool:
         raise TypeError(f"volume must be real, got {u.dtype}")
     if u.ndim != 3 or u.numel() == 0:
-        raise ValueError(f"volume must be (z, y, x) with voxels in it, got the shape {tuple(u.shape)}")
+        raise ValueError(
+            f"volume must be (z, y, x) with voxels in it, got the shape {tuple(u.shape)}"
+        )
     u = u.to(torch.promote_types(u.dtype, torch.float32))
     bad = int((~torch.isfinite(u)).sum())
     if bad:
@@ -404,15 +474,19 @@ def _smoothed(u: Tensor, sigma: float) -> Tensor:
 
 
 def _spectrum(covariance: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Power spectrum of noise of variance 1 on a volume of a shape, as ``bm4d`` counts it: its sum is voxels²."""
+    """Power spectrum of noise of variance 1 on a volume of a shape, as ``bm4d`` counts it: its
+    sum is voxels²."""
     cov = np.asarray(covariance, dtype=np.float64)
     if cov.ndim != 3 or any(n % 2 == 0 or n > m for n, m in zip(cov.shape, shape, strict=False)):
         raise ValueError(
-            f"covariance must be 3-D with odd numbers of voxels, at most the volume's {shape}, got {cov.shape}"
+            f"covariance must be 3-D with odd numbers of voxels, at most the volume's {shape}, "
+            f"got {cov.shape}"
         )
     middle = tuple(n // 2 for n in cov.shape)
     if not np.isfinite(cov).all() or not cov[middle] > 0:
-        raise ValueError("covariance must be finite and positive in its middle, where the voxel itself is")
+        raise ValueError(
+            "covariance must be finite and positive in its middle, where the voxel itself is"
+        )
     whole_ = np.zeros(shape)
     whole_[tuple(slice(n) for n in cov.shape)] = cov / cov[middle]
     whole_ = np.roll(whole_, [-k for k in middle], axis=(0, 1, 2))

@@ -13,7 +13,8 @@ __all__ = ["NormalOperator"]
 class NormalOperator(Protocol):
     """AᵀWA of a scan, exact or a model of it: all that PWLS and MBIR ask of the data beside AᵀW y.
 
-    Of an inset it is :class:`recon.gram.gram.Gram`, of a whole field :class:`recon.mbir.field.FieldGram`.
+    Of an inset it is :class:`recon.gram.gram.Gram`, of a whole field
+    :class:`recon.mbir.field.FieldGram`.
     """
 
     def apply(self, x: Tensor, /) -> Tensor:
@@ -25,5 +26,6 @@ class NormalOperator(Protocol):
         ...
 
     def information(self, mu_per_hu: float, frequency: float = ...) -> float:
-        """On a wave of ``frequency`` lp/mm (0.5), 1/(HU² mm³) (2-D: mm²); ``mu_per_hu`` is 1 HU in mm⁻¹."""
+        """On a wave of ``frequency`` lp/mm (0.5), 1/(HU² mm³) (2-D: mm²); ``mu_per_hu`` is 1 HU
+        in mm⁻¹."""
         ...

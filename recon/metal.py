@@ -1,4 +1,5 @@
-"""Metal in a volume: nothing here corrects what it does to the tissue beside it, so that a warning names it."""
+"""Metal in a volume: nothing here corrects what it does to the tissue beside it, so that a
+warning names it."""
 
 from __future__ import annotations
 
@@ -19,8 +20,9 @@ def metal_warnings(volume: Tensor) -> list[str]:
     """Whether a volume in HU reads more than tissue can, and more than its noise explains.
 
     Args:
-        volume: any shape, HU. Its noise is taken from the median deviation from the median: where most of it is one
-            tissue that is the noise, else more, and metal has to be denser to be noticed.
+        volume: any shape, HU. Its noise is taken from the median deviation from the median: where
+            most of it is one tissue that is the noise, else more, and metal has to be denser to be
+            noticed.
 
     Returns:
         Warnings; empty if there is no metal.
@@ -30,6 +32,7 @@ def metal_warnings(volume: Tensor) -> list[str]:
     if not peak > DENSEST_HU + _SIGMAS * noise:
         return []
     return [
-        f"the volume reaches {peak:.0f} HU, more than any tissue: metal hardens the beam and starves the rays behind "
+        f"the volume reaches {peak:.0f} HU, more than any tissue: metal hardens the beam and "
+        "starves the rays behind "
         "it; streaks and shades beside it are no tissue, and are not corrected"
     ]

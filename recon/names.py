@@ -1,4 +1,5 @@
-"""Names of methods, kernels, filters and priors, which can be checked before anything that computes is loaded."""
+"""Names of methods, kernels, filters and priors, which can be checked before anything that
+computes is loaded."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ METHODS: tuple[str, ...] = ("fbp", "pwls", "mbir")
 """Of :func:`recon.reconstruct`."""
 
 KERNELS: tuple[str, ...] = ("soft", "standard", "detail", "bone", "ram-lak")
-"""Reconstruction kernels of filtered backprojection, from smooth to sharp (:mod:`recon.analytic.ramp`)."""
+"""Reconstruction kernels of filtered backprojection, from smooth to sharp
+(:mod:`recon.analytic.ramp`)."""
 
 FILTERS: tuple[str, ...] = ("gaussian", "perona_malik", "bilateral", "nlm", "tv", "bm4d")
 """Of :mod:`recon.filters`; a hyphen is as good as the underscore."""
@@ -40,7 +42,8 @@ def filter_name(text: str) -> str:
 
 
 def split_method(spec: Any) -> tuple[str, dict[str, Any]]:
-    """A method of :func:`recon.reconstruct` and its options, from ``fbp:soft`` or ``mbir:prior=perona-malik``.
+    """A method of :func:`recon.reconstruct` and its options, from ``fbp:soft`` or
+    ``mbir:prior=perona-malik``.
 
     Of ``weights`` and ``network`` the texts are given; ``prior`` is a text, too.
 
@@ -87,14 +90,19 @@ def mbir_options(text: str) -> dict[str, str]:
         raise FileNotFoundError(f"no such file: {given['weights'] or 'weights= without a name'}")
     if "network" in given:
         if "weights" not in given:
-            raise ValueError("network of mbir is the class of weights of yours: give it with weights=FILE")
+            raise ValueError(
+                "network of mbir is the class of weights of yours: give it with weights=FILE"
+            )
         if not is_module_name(given["network"]):
-            raise ValueError(f"network of mbir must be package.module:Class, got {given['network']!r}")
+            raise ValueError(
+                f"network of mbir must be package.module:Class, got {given['network']!r}"
+            )
     return given
 
 
 def check_prior(text: str) -> None:
-    """Refuse what names no prior of MBIR, as far as its text tells: a filter, or ``package.module:function``.
+    """Refuse what names no prior of MBIR, as far as its text tells: a filter, or
+    ``package.module:function``.
 
     Raises:
         ValueError: neither; the message lists the filters.
@@ -103,7 +111,8 @@ def check_prior(text: str) -> None:
         return
     if filter_name(text) not in FILTERS:
         raise ValueError(
-            f"unknown prior of mbir {text!r}: use one of {', '.join(FILTERS)}, or package.module:function"
+            f"unknown prior of mbir {text!r}: use one of {', '.join(FILTERS)}, or "
+            "package.module:function"
             f"{meant(filter_name(text), FILTERS)}"
         )
 
@@ -111,7 +120,9 @@ def check_prior(text: str) -> None:
 def is_module_name(text: str) -> bool:
     """Whether a text has the form ``package.module:name``."""
     module, _, name = text.partition(":")
-    return bool(module and name) and all(part.isidentifier() for part in [*module.split("."), *name.split(".")])
+    return bool(module and name) and all(
+        part.isidentifier() for part in [*module.split("."), *name.split(".")]
+    )
 
 
 def loaded(spec: str) -> Callable[..., Any]:
@@ -127,7 +138,11 @@ def loaded(spec: str) -> Callable[..., Any]:
         for part in name.split("."):
             found = getattr(found, part)
     except Exception as error:  # whatever a foreign module does when it is imported
-        said = str(error) if isinstance(error, ImportError | AttributeError) else f"{type(error).__name__}: {error}"
+        said = (
+            str(error)
+            if isinstance(error, ImportError | AttributeError)
+            else f"{type(error).__name__}: {error}"
+        )
         raise ValueError(
             f"cannot load {spec!r}: {said} (is its folder on PYTHONPATH?){meant_method(module)}"
         ) from error
@@ -138,5 +153,6 @@ def loaded(spec: str) -> Callable[..., Any]:
 
 
 def meant_method(head: str) -> str:
-    """`` (did you mean 'mbir'?)`` where the first part of a name is like that of a method of the package."""
+    """`` (did you mean 'mbir'?)`` where the first part of a name is like that of a method of the
+    package."""
     return meant(head, ("fbp", "pwls", "mbir", "files", *FILTERS))

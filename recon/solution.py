@@ -1,4 +1,5 @@
-"""What a method makes of a scan, before :func:`recon.api.reconstruct` makes a volume with a report of it."""
+"""What a method makes of a scan, before :func:`recon.api.reconstruct` makes a volume with a
+report of it."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ class Solution(NamedTuple):
 
 
 def tested(name: str, said: list[str], test: Callable[..., T], *args: Any) -> list[T]:
-    """What a test of a finished volume finds. A test that fails must not lose the volume: it becomes a warning.
+    """What a test of a finished volume finds. A test that fails must not lose the volume: it
+    becomes a warning.
 
     Args:
         name: of the test, for the warning.
@@ -51,5 +53,7 @@ def tested(name: str, said: list[str], test: Callable[..., T], *args: Any) -> li
         return [test(*args)]
     except Exception as error:
         _LOG.debug("%s failed", name, exc_info=True)
-        said.append(f"{name} failed ({type(error).__name__}: {error}), so the volume is not tested by it")
+        said.append(
+            f"{name} failed ({type(error).__name__}: {error}), so the volume is not tested by it"
+        )
         return []

@@ -1,16 +1,19 @@
-"""Tests run in two processes (``-n 2`` of pyproject.toml; ``-n 0`` runs them in one), which share the cores."""
+"""Tests run in two processes (``-n 2`` of pyproject.toml; ``-n 0`` runs them in one), which
+share the cores."""
 
 import os
 
 import pytest
 
-# Triton reads it when it is first imported, by whichever test: its kernels then run on the CPU, see test_triton.py.
+# Triton reads it when it is first imported, by whichever test: its kernels then run on the CPU, see
+# test_triton.py.
 os.environ.setdefault("TRITON_INTERPRET", "1")
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _cores_are_shared():
-    """Each process computes with its share of the cores: threads that wait for each other are slower than few."""
+    """Each process computes with its share of the cores: threads that wait for each other are
+    slower than few."""
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     if workers > 1:
         import torch

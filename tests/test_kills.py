@@ -1,7 +1,9 @@
-"""Killed (SIGKILL) at random moments, commands lose no file and little work, and end as if nothing had been.
+"""Killed (SIGKILL) at random moments, commands lose no file and little work, and end as if nothing
+had been.
 
-Each command runs in its own process, as a person starts it; its settings alone are small. What dies in the middle of a
-piece or of a write is :mod:`recon.study.test_store` and :mod:`train.test_run`; here nobody chooses the moment.
+Each command runs in its own process, as a person starts it; its settings alone are small. What dies
+in the middle of a piece or of a write is :mod:`recon.study.test_store` and :mod:`train.test_run`;
+here nobody chooses the moment.
 """
 
 import io
@@ -49,8 +51,10 @@ Store.piece = noted
 Path(out + ".begun").touch()
 if name == "evaluate":
     # On the voxels that the network knows.
-    Path(out + ".yaml").write_text("name: insert" + INSERT.replace("voxel_mm: 0.4", "voxel_mm: 0.2"))
-    start = ["evaluate", "--task", out + ".yaml", "--method", "mbir", "--method", "gaussian@fbp:soft", "--n", "16"]
+    insert = "name: insert" + INSERT.replace("voxel_mm: 0.4", "voxel_mm: 0.2")
+    Path(out + ".yaml").write_text(insert)
+    methods = ["--method", "mbir", "--method", "gaussian@fbp:soft"]
+    start = ["evaluate", "--task", out + ".yaml", *methods, "--n", "16"]
 else:
     start = [name, "--quick"] if name == "compare" else ["study", name, "--quick"]
 assert main([*start, "--out", out]) == 0
@@ -63,16 +67,23 @@ from train import __main__ as command_line
 out = sys.argv[1]
 command_line.build = stub_build(StubObjective(pause=0.03))
 Path(out + ".begun").touch()
-more = ["--resume"] if any((Path(out) / f"checkpoint{x}.safetensors").exists() for x in ("", ".previous")) else []
-assert command_line.main(["--config", out + ".yaml", "--out", out, "--threads", "1", "--no-tensorboard", *more]) == 0
+begun = any((Path(out) / f"checkpoint{x}.safetensors").exists() for x in ("", ".previous"))
+arguments = ["--config", out + ".yaml", "--out", out, "--threads", "1", "--no-tensorboard"]
+assert command_line.main([*arguments, *(["--resume"] if begun else [])]) == 0
 """
 
 
 def _start(script, *arguments):
-    path = os.pathsep.join([str(Path(__file__).parent / "helpers"), str(Path(__file__).parents[1]), *sys.path])
+    path = os.pathsep.join(
+        [str(Path(__file__).parent / "helpers"), str(Path(__file__).parents[1]), *sys.path]
+    )
     command = [sys.executable, "-c", script, *map(str, arguments)]
-    return subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}, stdout=subprocess.DEVNULL,
-                            stderr=subprocess.PIPE)  # fmt: skip
+    return subprocess.Popen(
+        command,
+        env={**os.environ, "PYTHONPATH": path},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
 
 
 def _whole(path):
@@ -89,8 +100,13 @@ def _whole(path):
 
 
 def _finished(folder):
-    """Names of the files that are there, whole; those that are being written have ``part`` or ``next`` in theirs."""
-    names = {p for p in folder.rglob("*") if p.is_file() and ".part." not in p.name and ".next." not in p.name}
+    """Names of the files that are there, whole; those that are being written have ``part`` or
+    ``next`` in theirs."""
+    names = {
+        p
+        for p in folder.rglob("*")
+        if p.is_file() and ".part." not in p.name and ".next." not in p.name
+    }
     for path in names:
         _whole(path)
     return names
@@ -116,7 +132,8 @@ def _uninterrupted(script, out, *arguments):
 
 
 def _killed(script, out, span, *arguments):
-    """Run until it is through, killed before within ``span`` s: number of kills, the longest work lost to one, s."""
+    """Run until it is through, killed before within ``span`` s: number of kills, the longest
+    work lost to one, s."""
     kills, lost = 0, 0.0
     rng = np.random.default_rng(len(arguments))
     while True:
@@ -146,7 +163,9 @@ def test_studies_killed_at_random_moments(name, tmp_path):
     kills, lost = _killed(STUDY, tmp_path / "killed", seconds, name)
     assert kills >= 2
     assert lost < LOST_S
-    killed, whole = ((tmp_path / f"{x}.computed").read_text().split("\n")[:-1] for x in ("killed", "whole"))
+    killed, whole = (
+        (tmp_path / f"{x}.computed").read_text().split("\n")[:-1] for x in ("killed", "whole")
+    )
     assert set(killed) == set(whole)
     assert len(killed) <= len(whole) + kills  # a piece that was computed, not yet written
     reports = [json.loads((tmp_path / x / "report.json").read_text()) for x in ("whole", "killed")]
@@ -154,7 +173,10 @@ def test_studies_killed_at_random_moments(name, tmp_path):
         report.pop("command", None)
         report["records"] = [r for r in report.get("records", ()) if r["figure"] != "seconds"]
     assert list(differences(*reports)) == []
-    names = [{p.relative_to(tmp_path / x) for p in (tmp_path / x).rglob("*")} for x in ("whole", "killed")]
+    names = [
+        {p.relative_to(tmp_path / x) for p in (tmp_path / x).rglob("*")}
+        for x in ("whole", "killed")
+    ]
     assert names[0] == names[1]  # and nothing half written is left
 
 
@@ -162,7 +184,8 @@ def test_studies_killed_at_random_moments(name, tmp_path):
 def test_training_killed_at_random_moments(tmp_path):
     assert LONGEST_INTERVAL <= LOST_S  # no configuration keeps less often
     settings = (
-        "steps: 200\nbatch: 4\nwarmup: 3\nema: 0.9\nvalidate_every: 50\nclip: 20.0\nlearning_rate: 0.02\n"
+        "steps: 200\nbatch: 4\nwarmup: 3\nema: 0.9\nvalidate_every: 50\nclip: "
+        "20.0\nlearning_rate: 0.02\n"
         "checkpoint_seconds: 0.3\n"
     )
     for name in ("killed", "whole"):
@@ -172,4 +195,6 @@ def test_training_killed_at_random_moments(tmp_path):
     assert kills >= 3
     assert lost < 30.0  # a hundred checkpoints
     assert_same_run(tmp_path / "killed", tmp_path / "whole")
-    assert not [p for p in (tmp_path / "killed").rglob("*") if ".part." in p.name or ".next." in p.name]
+    assert not [
+        p for p in (tmp_path / "killed").rglob("*") if ".part." in p.name or ".next." in p.name
+    ]

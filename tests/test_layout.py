@@ -1,4 +1,4 @@
-"""The shape of the packages, read from the sources: which way imports go, and how long a module is.
+"""The shape of the packages, read from the sources: which way imports go.
 
 Imports count wherever they stand: at the top, in a function, and for the type checker only.
 """
@@ -9,7 +9,6 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 UPWARDS = ("torchpcct", "recon", "recon.study", "recon.cli", "train")
-LONGEST = 800
 
 
 def _modules():
@@ -31,10 +30,15 @@ def _imports(module):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            above = package.split(".")[: len(package.split(".")) + 1 - node.level] if node.level else []
+            above = (
+                package.split(".")[: len(package.split(".")) + 1 - node.level] if node.level else []
+            )
             base = ".".join([*above, *([node.module] if node.module else [])])
             # What is imported may be a module of the package or a name in it.
-            names += [f"{base}.{alias.name}" if f"{base}.{alias.name}" in MODULES else base for alias in node.names]
+            names += [
+                f"{base}.{alias.name}" if f"{base}.{alias.name}" in MODULES else base
+                for alias in node.names
+            ]
     return {name for name in names if name in MODULES and name != module}
 
 
@@ -50,10 +54,8 @@ def test_no_import_circles():
 
 
 def test_no_import_points_up():
-    """torchpcct ← recon ← train, and within recon the studies and the command line above all else."""
-    assert not [(m, needed) for m, needs in GRAPH.items() for needed in needs if _level(needed) > _level(m)]
-
-
-def test_no_module_is_long():
-    lengths = {module: len(path.read_text(encoding="utf-8").splitlines()) for module, path in MODULES.items()}
-    assert not {module: n for module, n in lengths.items() if n > LONGEST}
+    """torchpcct ← recon ← train, and within recon the studies and the command line above all
+    else."""
+    assert not [
+        (m, needed) for m, needs in GRAPH.items() for needed in needs if _level(needed) > _level(m)
+    ]

@@ -17,7 +17,9 @@ NAMES = sorted(p.name for p in FOLDER.glob("*.ipynb"))
 
 
 def outputs(notebook):
-    return [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    return [
+        output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs
+    ]
 
 
 def pictures(notebook):
@@ -34,7 +36,11 @@ def run(name, folder, timeout):
     path = folder / name
     shutil.copy(FOLDER / name, path)
     done = subprocess.run(
-        [sys.executable, FOLDER / "execute.py", path], capture_output=True, text=True, timeout=timeout, check=False
+        [sys.executable, FOLDER / "execute.py", path],
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     notebook = nbformat.read(path, as_version=4)
@@ -62,23 +68,33 @@ WRITING = {"save", "File", "write_text", "write_bytes", "savefig", "imwrite", "o
 
 
 def harms(source):
-    """Calls of an example that delete or move a file, or write one whose name a user may have given to theirs."""
+    """Calls of an example that delete or move a file, or write one whose name a user may have
+    given to theirs."""
     found = []
     for call in (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)):
         name = getattr(call.func, "attr", getattr(call.func, "id", ""))
         owner = getattr(getattr(call.func, "value", None), "id", "")
-        modes = [a.value for a in call.args[1:] if isinstance(a, ast.Constant) and isinstance(a.value, str)]
+        modes = [
+            a.value
+            for a in call.args[1:]
+            if isinstance(a, ast.Constant) and isinstance(a.value, str)
+        ]
         reads = name in ("File", "open") and not any(set(mode) & set("wax+") for mode in modes)
         # A name by itself lies in the folder where the notebook runs, which is the user's.
         bare = call.args and isinstance(call.args[0], ast.Constant | ast.Name | ast.JoinedStr)
-        deletes = name in DELETING and owner in ("os", "shutil", "Path", "") and bool(owner or not call.args)
+        deletes = (
+            name in DELETING
+            and owner in ("os", "shutil", "Path", "")
+            and bool(owner or not call.args)
+        )
         if deletes or name in ("unlink", "rmtree") or (name in WRITING and not reads and bare):
             found.append(ast.unparse(call))
     return found
 
 
 def test_a_harmful_example_is_found():
-    """What the scan below looks for: ``your_own_data.ipynb`` once overwrote and deleted the user's ``tooth.h5``."""
+    """What the scan below looks for: ``your_own_data.ipynb`` once overwrote and deleted the
+    user's ``tooth.h5``."""
     source = """
 with h5py.File("tooth.h5", "w") as file: pass
 for name in ("tooth.h5", "tooth.mha"): Path(name).unlink()
@@ -95,7 +111,9 @@ text.replace("a", "b")
 def test_no_notebook_writes_or_deletes_what_it_has_not_made(name):
     notebook = nbformat.read(FOLDER / name, as_version=4)
     code = [c.source for c in notebook.cells if c.cell_type == "code"]
-    plain = "\n".join(line for source in code for line in source.splitlines() if not line.startswith("%"))
+    plain = "\n".join(
+        line for source in code for line in source.splitlines() if not line.startswith("%")
+    )
     assert not harms(plain)
 
 
@@ -115,14 +133,21 @@ def test_stored_notebook_is_of_the_shipped_weights(name):
     notebook = nbformat.read(FOLDER / name, as_version=4)
     if "mbir" in "".join(c.source for c in notebook.cells if c.cell_type == "code"):
         stored = notebook.metadata.get("torchpcct", {}).get("weights_sha256")
-        assert stored == Mbir.load().weights_sha256, f"execute it again: python notebooks/execute.py notebooks/{name}"
+        assert stored == Mbir.load().weights_sha256, (
+            f"execute it again: python notebooks/execute.py notebooks/{name}"
+        )
 
 
 @pytest.mark.extended
 @pytest.mark.parametrize("name", NAMES)
 def test_stored_notebook_is_of_the_sources_as_they_are(name):
-    """A picture of an older program, 47 of 255 grey levels off, once stood there under weights that were right."""
-    stored = nbformat.read(FOLDER / name, as_version=4).metadata.get("torchpcct", {}).get("sources_sha256")
+    """A picture of an older program, 47 of 255 grey levels off, once stood there under weights
+    that were right."""
+    stored = (
+        nbformat.read(FOLDER / name, as_version=4)
+        .metadata.get("torchpcct", {})
+        .get("sources_sha256")
+    )
     again = f"execute it again: python notebooks/execute.py notebooks/{name}"
     if stored is None:
         pytest.skip(f"stored before digests of sources were kept; {again}")
@@ -132,7 +157,9 @@ def test_stored_notebook_is_of_the_sources_as_they_are(name):
 def test_the_digest_of_a_notebook_sees_code_alone(tmp_path, monkeypatch):
     script = _execute()
     assert set(script.MADE_BY) == set(NAMES)
-    assert all((script.ROOT / entry).exists() for entries in script.MADE_BY.values() for entry in entries)
+    assert all(
+        (script.ROOT / entry).exists() for entries in script.MADE_BY.values() for entry in entries
+    )
     monkeypatch.setattr(script, "ROOT", tmp_path)
     monkeypatch.setattr(script, "MADE_BY", {"n": ("a.py", "folder")})
     (tmp_path / "folder").mkdir()
@@ -143,7 +170,10 @@ def test_the_digest_of_a_notebook_sees_code_alone(tmp_path, monkeypatch):
         return script.sources_digest("n")
 
     first = digest('"""Doc."""\ndef f(x):\n    """What."""\n    return x + 1\n')
-    assert digest('"""Other."""\n# a comment\ndef f(x):\n    """Else."""\n    return (x + 1)\n') == first
+    assert (
+        digest('"""Other."""\n# a comment\ndef f(x):\n    """Else."""\n    return (x + 1)\n')
+        == first
+    )
     assert digest('"""Doc."""\ndef f(x):\n    """What."""\n    return x + 2\n') != first
     last = digest("x = 1")
     (tmp_path / "folder" / "b.yaml").write_text("x: 2", encoding="utf-8")
@@ -174,8 +204,13 @@ def test_your_own_data_runs(tmp_path):
     assert len(pictures(notebook)) == 2
     assert sorted(p.name for p in tmp_path.iterdir()) == ["tooth.h5", "your_own_data.ipynb"]
     assert (tmp_path / "tooth.h5").read_bytes() == b"the user's own"
-    texts = [o.data["text/markdown"] for o in outputs(notebook) if "text/markdown" in o.get("data", {})]
-    quieter = {row.split(" | ")[0]: float(row.split(" | ")[-1].rstrip(" |")) for row in texts[2].splitlines()[2:]}
+    texts = [
+        o.data["text/markdown"] for o in outputs(notebook) if "text/markdown" in o.get("data", {})
+    ]
+    quieter = {
+        row.split(" | ")[0]: float(row.split(" | ")[-1].rstrip(" |"))
+        for row in texts[2].splitlines()[2:]
+    }
     assert quieter["| FBP, ram-lak"] == 1.0
     assert abs(quieter["| FBP, soft"] - 1.0) < 0.1  # a blur of the reference
     assert quieter["| PWLS, 0.03"] > 1.5
@@ -192,14 +227,18 @@ def test_benchmark_runs(tmp_path):
 @pytest.mark.extended
 def test_reading_a_plaque_runs(tmp_path):
     notebook = run("reading_a_plaque.ipynb", tmp_path, 1800)
-    (text,) = (o.data["text/markdown"] for o in outputs(notebook) if "text/markdown" in o.get("data", {}))
+    (text,) = (
+        o.data["text/markdown"] for o in outputs(notebook) if "text/markdown" in o.get("data", {})
+    )
     assert float(text.split("core: ")[1].split(".\n")[0]) > 0.9  # the scan holds a core
 
 
 @pytest.mark.extended
 def test_train_your_own_prior_runs(tmp_path):
     notebook = run("train_your_own_prior.ipynb", tmp_path, 3600)
-    texts = [o.data["text/markdown"] for o in outputs(notebook) if "text/markdown" in o.get("data", {})]
+    texts = [
+        o.data["text/markdown"] for o in outputs(notebook) if "text/markdown" in o.get("data", {})
+    ]
     assert "weights.safetensors" in texts[0]
     noise = [float(row.split(" | ")[-1].rstrip(" |")) for row in texts[1].splitlines()[2:]]
     assert len(noise) == 3
@@ -209,9 +248,13 @@ def test_train_your_own_prior_runs(tmp_path):
 
 @pytest.mark.extended
 def test_a_full_run_is_a_full_run(tmp_path):
-    """The switch is found in the cell itself: a tag once was lost, and ``--full`` ran the quick version."""
+    """The switch is found in the cell itself: a tag once was lost, and ``--full`` ran the quick
+    version."""
     path = tmp_path / "small.ipynb"
-    for source, message in (("QUICK = True\nassert not QUICK", ""), ("quick = True", "no line QUICK = True")):
+    for source, message in (
+        ("QUICK = True\nassert not QUICK", ""),
+        ("quick = True", "no line QUICK = True"),
+    ):
         nbformat.write(nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source)]), path)
         command = [sys.executable, FOLDER / "execute.py", "--full", path]
         done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)

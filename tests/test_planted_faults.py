@@ -1,4 +1,5 @@
-"""The table of planted faults (bench/faults.yaml): it must not fall behind the source that it breaks."""
+"""The table of planted faults (bench/faults.yaml): it must not fall behind the source that it
+breaks."""
 
 import ast
 import importlib.util
@@ -18,7 +19,9 @@ def test_every_fault_can_be_planted_and_has_its_test(fault):
     assert fault.old != fault.new
     file, _, name = fault.test.partition("::")
     tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
-    assert not name or name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+    assert not name or name in {
+        node.name for node in tree.body if isinstance(node, ast.FunctionDef)
+    }
 
 
 def test_faults_are_many_and_differ():

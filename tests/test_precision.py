@@ -1,6 +1,7 @@
 """Float32 against float64 at small sizes (bench/precision.py): rounding, and nothing beside it.
 
-The bounds are about three times what was measured; they hold for every processor that rounds as IEEE 754 says.
+The bounds are about three times what was measured; they hold for every processor that rounds as
+IEEE 754 says.
 """
 
 import importlib.util
@@ -8,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-_SPEC = importlib.util.spec_from_file_location("precision", Path(__file__).parent / "bench/precision.py")
+_SPEC = importlib.util.spec_from_file_location(
+    "precision", Path(__file__).parent / "bench/precision.py"
+)
 precision = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(precision)
 
@@ -62,7 +65,8 @@ def test_weights_that_are_nearly_zero_count_as_zero():
 @pytest.mark.extended
 @pytest.mark.parametrize("where", ["inset", "whole field"])
 def test_pwls_forgets_a_start_far_away(where):
-    """Rounding of 10⁴ HU must not stay in the volume: followed by recurrence alone, the inset's were off by 2 HU."""
+    """Rounding of 10⁴ HU must not stay in the volume: followed by recurrence alone, the inset's
+    were off by 2 HU."""
     assert precision.starts(where, "10⁴ HU")["rms"] < 0.6
 
 
@@ -73,6 +77,7 @@ def test_bins_that_hardly_differ_are_decomposed_to_their_noise():
 
 
 def test_what_has_no_answer_is_refused():
-    """Two bins of one spectrum, an empty bin, an observer with fewer pairs than channels or with equal channels."""
+    """Two bins of one spectrum, an empty bin, an observer with fewer pairs than channels or with
+    equal channels."""
     for row in precision.hard_refusals():
         assert row["refused"], row["what"]

@@ -1,4 +1,5 @@
-"""Sound scans are told nothing wrong: some that ``tests/bench/false_alarms.py`` draws; and how they are made."""
+"""Sound scans are told nothing wrong: some that ``tests/bench/false_alarms.py`` draws; and how
+they are made."""
 
 import importlib.util
 from pathlib import Path
@@ -11,7 +12,9 @@ from sound_scans import BALL, BOX, CYLINDER, Solid, draw, transmissions
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, full_turn
 from torchpcct.checks.opposite_rays import geometry_test
 
-_SPEC = importlib.util.spec_from_file_location("false_alarms", Path(__file__).parent / "bench/false_alarms.py")
+_SPEC = importlib.util.spec_from_file_location(
+    "false_alarms", Path(__file__).parent / "bench/false_alarms.py"
+)
 false_alarms = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(false_alarms)
 
@@ -20,7 +23,9 @@ _SPEC.loader.exec_module(false_alarms)
 ONCE_ALARMED = [(50_439, 25_000), (50_447, 60_000)]
 
 
-@pytest.mark.parametrize(("seed", "readings"), [*((seed, 25_000) for seed in range(20)), *ONCE_ALARMED])
+@pytest.mark.parametrize(
+    ("seed", "readings"), [*((seed, 25_000) for seed in range(20)), *ONCE_ALARMED]
+)
 def test_sound_scans_raise_no_alarm(seed, readings):
     drawn = draw(seed, readings=readings)
     assert false_alarms.alarms(drawn) == [], drawn.text
@@ -28,20 +33,28 @@ def test_sound_scans_raise_no_alarm(seed, readings):
 
 @pytest.mark.parametrize(
     ("kind", "seed", "cause", "size"),
-    [("fan", 1, "centre", -0.7), ("fan", 22, "scale", 0.03), ("fan", 1, "step", -0.012), ("cone", 5, "centre", 1.3)],
+    [
+        ("fan", 1, "centre", -0.7),
+        ("fan", 22, "scale", 0.03),
+        ("fan", 1, "step", -0.012),
+        ("cone", 5, "centre", 1.3),
+    ],
 )
 def test_wrong_descriptions_are_measured(kind, seed, cause, size):
     drawn = draw(seed, kind=kind, readings=25_000)
     found = geometry_test(*false_alarms.misdescribed(drawn, cause, size))
     assert found.findings, drawn.text
-    assert abs(found.sizes[cause] - size) < 3.0 * found.errors[cause] < abs(size)  # ± is two of them
+    # ± is two of them
+    assert abs(found.sizes[cause] - size) < 3.0 * found.errors[cause] < abs(size)
 
 
 def test_all_parts_of_a_focal_spot_shine():
     """A spot to one side would be a centre in another place."""
     g = ConeBeam(full_turn(4), 300.0, 500.0, 40, 3, (2.0, 2.0))
     for subs in ((3, 2, 1), (3, 2, 3), (3, 7, 1)):
-        shone = transmissions(g, [Solid(BALL, (0.0, 0.0, 0.0), (20.0, 20.0, 50.0), 0.02)], subs=subs, spot=6.0)
+        shone = transmissions(
+            g, [Solid(BALL, (0.0, 0.0, 0.0), (20.0, 20.0, 50.0), 0.02)], subs=subs, spot=6.0
+        )
         middle = ((1.0 - shone) * (np.arange(40) - 19.5)).sum(2) / (1.0 - shone).sum(2)
         assert np.abs(middle).max() < 0.002
 
@@ -58,9 +71,19 @@ def test_transmissions_are_those_of_exact_chords(geometry):
     cone = geometry.has_rows
     place, radii = (2.0, 10.0, -15.0), (5.0, 20.0, 28.0)
     bodies = [Ellipsoid(place if cone else place[1:], radii if cone else radii[1:], 0.4, 0.02)]
-    solids = [Solid(BALL if cone else CYLINDER, (-15.0, 10.0, 2.0), (28.0, 20.0, 5.0 if cone else 1e5), 0.02, 0.4)]
+    solids = [
+        Solid(
+            BALL if cone else CYLINDER,
+            (-15.0, 10.0, 2.0),
+            (28.0, 20.0, 5.0 if cone else 1e5),
+            0.02,
+            0.4,
+        )
+    ]
     expected = np.exp(-line_integrals(geometry, bodies, sub=1))
-    np.testing.assert_allclose(transmissions(geometry, solids, subs=(1, 1, 1)), expected, rtol=1e-12)
+    np.testing.assert_allclose(
+        transmissions(geometry, solids, subs=(1, 1, 1)), expected, rtol=1e-12
+    )
 
 
 def test_chords_of_tilted_boxes_and_cylinders():
@@ -73,4 +96,6 @@ def test_chords_of_tilted_boxes_and_cylinders():
     assert -np.log(transmissions(along, box, **one)).item() == pytest.approx(0.8)
     assert -np.log(transmissions(along, rod, **one)).item() == pytest.approx(0.8)
     # Along y through a disc 2 mm thick that is tilted by 45° about x: 2 mm · √2.
-    assert -np.log(transmissions(across, upright, **one)).item() == pytest.approx(0.2 * np.sqrt(2.0))
+    assert -np.log(transmissions(across, upright, **one)).item() == pytest.approx(
+        0.2 * np.sqrt(2.0)
+    )

@@ -1,16 +1,18 @@
 """Photon-counting CT in PyTorch: scenes, scanners, scans, projectors, metrics.
 
-Read in the order of the data: :mod:`~torchpcct.geometry` (axes, angles, grids), :mod:`~torchpcct.scene` (what is
-scanned), :mod:`~torchpcct.scanner` (by what), :mod:`~torchpcct.acquisition` (the simulation), :mod:`~torchpcct.scan`
-(its readings), :mod:`~torchpcct.formats` (files of other programs), :mod:`~torchpcct.projector`,
+Read in the order of the data: :mod:`~torchpcct.geometry` (axes, angles, grids),
+:mod:`~torchpcct.scene` (what is scanned), :mod:`~torchpcct.scanner` (by what),
+:mod:`~torchpcct.acquisition` (the simulation), :mod:`~torchpcct.scan` (its readings),
+:mod:`~torchpcct.formats` (files of other programs), :mod:`~torchpcct.projector`,
 :mod:`~torchpcct.volume`, :mod:`~torchpcct.metrics`. Reconstruction is the package :mod:`recon`.
 """
 
 import os
 from typing import TYPE_CHECKING, Any
 
-# The threads of the kernels (threads.py) and of torch take turns. By default an idle OpenMP thread spins and steals the
-# core from the others: several times slower. OpenMP reads it when torch loads, so it stands before anything else.
+# The threads of the kernels (threads.py) and of torch take turns. By default an idle OpenMP thread
+# spins and steals the core from the others: several times slower. OpenMP reads it when torch loads,
+# so it stands before anything else.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from torchpcct.cache_folder import ensure_cache
@@ -54,13 +56,17 @@ _LAZY = {
 
 
 def _check_cache(folder: str, home: str) -> None:
-    """Warn if numba can keep compiled kernels neither beside the package nor at home: loading a kernel would fail."""
-    if "NUMBA_CACHE_DIR" in os.environ or any(os.access(_existing(path), os.W_OK) for path in (folder, home)):
+    """Warn if numba can keep compiled kernels neither beside the package nor at home: loading a
+    kernel would fail."""
+    if "NUMBA_CACHE_DIR" in os.environ or any(
+        os.access(_existing(path), os.W_OK) for path in (folder, home)
+    ):
         return
     import warnings
 
     warnings.warn(
-        f"numba can keep compiled kernels neither in {folder} nor in {home}: set NUMBA_CACHE_DIR to a folder that you "
+        f"numba can keep compiled kernels neither in {folder} nor in {home}: set NUMBA_CACHE_DIR "
+        "to a folder that you "
         "can write",
         RuntimeWarning,
         stacklevel=2,

@@ -14,11 +14,14 @@ __all__ = ["OPEN_GAP_STEPS", "SAME_VIEW", "is_offset", "view_steps"]
 
 Floats = NDArray[np.float64]
 
-#: A gap between neighbouring views counts as the end of the scan when it exceeds this many median steps.
+# : A gap between neighbouring views counts as the end of the scan when it exceeds this many median
+# steps.
 OPEN_GAP_STEPS = 3.0
-#: Views closer than this share of the mean step are repetitions of one view (angles are stored with few digits).
+# : Views closer than this share of the mean step are repetitions of one view (angles are stored
+# with few digits).
 SAME_VIEW = 0.02
-#: A detector is an offset one if it reaches farther to one side by more than this share of its width.
+# : A detector is an offset one if it reaches farther to one side by more than this share of its
+# width.
 OFFSET_SHARE = 0.02
 
 
@@ -31,13 +34,16 @@ def view_steps(
     Args:
         angles: ``(views,)`` rad, any order, any number of turns.
         period: angle after which the scan repeats: 2π, or π for parallel rays.
-        smallest_opening: gaps up to this angle in rad never end the scan; the views beside them fill in.
+        smallest_opening: gaps up to this angle in rad never end the scan; the views beside them
+            fill in.
 
     Returns:
-        ``steps`` ``(views,)`` rad: half the gap to the neighbours on either side, shared among views at the same angle;
-        ``start`` and ``span`` of the covered arc in rad. A gap of more than three median steps ends the scan: the views
-        beside it then stand for as much on the open side as on the other, and ``span < period``. Without such a gap the
-        scan is closed, ``span == period`` and the steps add up to it.
+        ``steps`` ``(views,)`` rad: half the gap to the neighbours on either side, shared among
+        views at the same angle;
+        ``start`` and ``span`` of the covered arc in rad. A gap of more than three median steps ends
+            the scan: the views
+        beside it then stand for as much on the open side as on the other, and ``span < period``.
+        Without such a gap the scan is closed, ``span == period`` and the steps add up to it.
     """
     wrapped = np.mod(angles, period)
     order = np.argsort(wrapped, kind="stable")
@@ -48,10 +54,13 @@ def view_steps(
     if distinct.size > 1 and distinct[0] + period - distinct[-1] <= same:
         group[group == group[-1]] = 0  # 0 and the period are the same view
         distinct = distinct[:-1]
-    gaps = np.append(np.diff(distinct), distinct[0] + period - distinct[-1])  # gap after each distinct view
+    # gap after each distinct view
+    gaps = np.append(np.diff(distinct), distinct[0] + period - distinct[-1])
     last = int(np.argmax(gaps))
     start, span = float(distinct[0]), period
-    if distinct.size > 1 and gaps[last] > max(OPEN_GAP_STEPS * float(np.median(gaps)), smallest_opening):
+    if distinct.size > 1 and gaps[last] > max(
+        OPEN_GAP_STEPS * float(np.median(gaps)), smallest_opening
+    ):
         before, after = gaps[last - 1], gaps[(last + 1) % distinct.size]
         open_gap = gaps[last]
         right, left = gaps.copy(), np.roll(gaps, 1)
@@ -70,10 +79,14 @@ def view_steps(
 
 @checked
 def is_offset(geometry: Any) -> bool:
-    """Whether the detector reaches farther to one side by more than ``OFFSET_SHARE`` of its width and two columns.
+    """Whether the detector reaches farther to one side by more than ``OFFSET_SHARE`` of its width
+    and two columns.
 
     Quarter-column offsets are not meant: there nearly every line is measured twice.
     """
     u = geometry.column_positions
     width = u[-1] - u[0]
-    return bool(abs(u[0] + u[-1]) > max(OFFSET_SHARE * width, 2.0 * width / max(u.size - 1, 1)) * (1.0 + 1e-9))
+    return bool(
+        abs(u[0] + u[-1])
+        > max(OFFSET_SHARE * width, 2.0 * width / max(u.size - 1, 1)) * (1.0 + 1e-9)
+    )

@@ -16,10 +16,12 @@ _TEMPORARY = "torchpcct-kernels-"
 
 
 def ensure_cache() -> None:
-    """Give numba a folder that it can write, where it would find none and refuse to load the kernels.
+    """Give numba a folder that it can write, where it would find none and refuse to load the
+    kernels.
 
-    That is so in an installation that may only be read, by a user without a home (containers, cron): the kernels are
-    kept in a temporary folder then, as long as the process lives, unless ``NUMBA_CACHE_DIR`` names a lasting one.
+    That is so in an installation that may only be read, by a user without a home (containers,
+    cron): the kernels are kept in a temporary folder then, as long as the process lives, unless
+    ``NUMBA_CACHE_DIR`` names a lasting one.
     """
     package = Path(__file__).parent
     if os.environ.get("NUMBA_CACHE_DIR") or os.access(package, os.W_OK) or _writable(_user_cache()):
@@ -33,7 +35,9 @@ def ensure_cache() -> None:
     if "numba" in sys.modules:
         sys.modules["numba"].config.CACHE_DIR = folder
     logging.getLogger(__name__).info(
-        "kernels are kept in %s while this process lives: set NUMBA_CACHE_DIR to a folder that lasts", folder
+        "kernels are kept in %s while this process lives: set NUMBA_CACHE_DIR to a folder that "
+        "lasts",
+        folder,
     )
 
 
@@ -44,7 +48,11 @@ def is_temporary(folder: Path) -> bool:
 
 def _user_cache() -> Path:
     """Where numba keeps what it may not write beside a module: that of XDG, or of the system."""
-    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or os.path.expanduser("~/.cache")
+    base = (
+        os.environ.get("XDG_CACHE_HOME")
+        or os.environ.get("LOCALAPPDATA")
+        or os.path.expanduser("~/.cache")
+    )
     return Path(base)
 
 

@@ -1,13 +1,16 @@
-"""Quantum noise that is a pure function of (seed, reading): the same for any thread count, crop or order.
+"""Quantum noise that is a pure function of (seed, reading): the same for any thread count, crop or
+order.
 
-Each reading owns a random stream, keyed by the seed and by the reading's index on the full detector. So a window
-of a scan carries exactly the noise that the full scan has there, and realisations can be spread over machines.
-The stream is SplitMix64 (Steele, Lea, Flood 2014); Poisson numbers come from Hörmann's transformed rejection PTRS
-(1993) for means of 10 and more, and from inversion below; normal numbers from Box and Muller (1958).
+Each reading owns a random stream, keyed by the seed and by the reading's index on the full
+detector. So a window of a scan carries exactly the noise that the full scan has there, and
+realisations can be spread over machines. The stream is SplitMix64 (Steele, Lea, Flood 2014);
+Poisson numbers come from Hörmann's transformed rejection PTRS (1993) for means of 10 and more, and
+from inversion below; normal numbers from Box and Muller (1958).
 
-An energy-integrating detector adds up the energies of a Poisson number of quanta: :func:`compound_poisson`. A lower
-dose of counts that are there already is drawn by :func:`thinned`.
-Other kernels that need random numbers take them from here too: :func:`seed_key`, :func:`stream` and :func:`draw`.
+An energy-integrating detector adds up the energies of a Poisson number of quanta:
+:func:`compound_poisson`. A lower dose of counts that are there already is drawn by :func:`thinned`.
+Other kernels that need random numbers take them from here too: :func:`seed_key`, :func:`stream` and
+:func:`draw`.
 """
 
 from __future__ import annotations
@@ -28,13 +31,16 @@ __all__ = ["compound_poisson", "draw", "normal", "poisson", "seed_key", "stream"
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX2 = np.uint64(0x94D049BB133111EB)
-_S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
+_S30 = np.uint64(30)
+_S27 = np.uint64(27)
+_S31 = np.uint64(31)
+_S11 = np.uint64(11)
 _OPERATIONS = 50  # about those of a random number
 _TO_UNIT = 1.0 / 9007199254740992.0  # 2**-53
 _BELOW_ONE = 1.0 - _TO_UNIT
 _NORMAL = 1e12
-"""Mean from which on Poisson numbers are drawn as normal ones: their skewness is a millionth, and the logarithms of
-probabilities would lose their last digit to rounding."""
+"""Mean from which on Poisson numbers are drawn as normal ones: their skewness is a millionth, and
+the logarithms of probabilities would lose their last digit to rounding."""
 _RARE = 1e-6
 """Of so many events, the probability below which those that happen are Poisson, to as much."""
 
@@ -76,7 +82,8 @@ def _poisson_one(mean: float, state: Any) -> float:
         state, u = draw(state)
         p = math.exp(-mean)
         k = 0.0
-        while u > p and k < 200.0:  # P(k ≥ 200 | mean < 10) < 1e-180: a guard against round-off only
+        # P(k ≥ 200 | mean < 10) < 1e-180: a guard against round-off only
+        while u > p and k < 200.0:
             u -= p
             k += 1.0
             p *= mean / k
@@ -144,7 +151,9 @@ def _binomial_one(n: float, p: float, state: Any) -> float:
 
 
 @njit(nogil=True, cache=True)
-def _thinned_rows(begin: int, end: int, counts: Any, first: Any, fraction: float, key: Any, out: Any) -> None:
+def _thinned_rows(
+    begin: int, end: int, counts: Any, first: Any, fraction: float, key: Any, out: Any
+) -> None:
     for i in range(begin, end):
         for j in range(counts.shape[1]):
             given = np.float64(counts[i, j])
@@ -165,7 +174,9 @@ def _thinned_rows(begin: int, end: int, counts: Any, first: Any, fraction: float
 
 
 @njit(nogil=True, cache=True)
-def _poisson_rows(begin: int, end: int, mean: Any, first: Any, scale: float, key: Any, out: Any) -> None:
+def _poisson_rows(
+    begin: int, end: int, mean: Any, first: Any, scale: float, key: Any, out: Any
+) -> None:
     for i in range(begin, end):
         for j in range(mean.shape[1]):
             lam = np.float64(mean[i, j]) * scale
@@ -185,7 +196,9 @@ def _normal_rows(begin: int, end: int, first: Any, key: Any, out: Any) -> None:
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _compound_rows(begin: int, end: int, mean: Any, quantum: Any, first: Any, scale: float, key: Any, out: Any) -> None:
+def _compound_rows(
+    begin: int, end: int, mean: Any, quantum: Any, first: Any, scale: float, key: Any, out: Any
+) -> None:
     for i in range(begin, end):
         for j in range(mean.shape[1]):
             q = np.float64(quantum[i, j])
@@ -198,12 +211,16 @@ def _compound_rows(begin: int, end: int, mean: Any, quantum: Any, first: Any, sc
                 out[i, j] = np.nan
 
 
-_QUANTA, _ELECTRONICS, _THINNING, _THINNED_ELECTRONICS = 0, 1, 2, 3
+_QUANTA = 0
+_ELECTRONICS = 1
+_THINNING = 2
+_THINNED_ELECTRONICS = 3
 """Purposes of a reading's random numbers: each has a stream of its own."""
 
 
 def seed_key(seed: int, purpose: int = _QUANTA) -> Any:
-    """Key of a seed's streams; ``TypeError`` or ``ValueError`` unless the seed is a whole number in 0 … 2**63 − 1."""
+    """Key of a seed's streams; ``TypeError`` or ``ValueError`` unless the seed is a whole number
+    in 0 … 2**63 − 1."""
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
         raise TypeError(f"seed must be a whole number, got {seed!r}")
     if not 0 <= seed < 2**63:
@@ -219,14 +236,19 @@ def _first(first: Any, rows: int) -> Any:
         raise TypeError(f"first_index must hold whole numbers, got {given.dtype}")
     index = np.ascontiguousarray(given, dtype=np.int64).reshape(-1)
     if index.size != rows:
-        raise ValueError(f"first_index must hold one index per row of the last axis, {rows}, got {index.size}")
+        raise ValueError(
+            f"first_index must hold one index per row of the last axis, {rows}, got {index.size}"
+        )
     return index
 
 
 def _like(name: str, values: Tensor, other: str, like: Tensor) -> None:
     """Refuse readings of another shape than those they belong to."""
     if values.shape != like.shape:
-        raise ValueError(f"{name} has shape {tuple(values.shape)}, {other} {tuple(like.shape)}: they must be equal")
+        raise ValueError(
+            f"{name} has shape {tuple(values.shape)}, {other} {tuple(like.shape)}: they must be "
+            "equal"
+        )
 
 
 def _drawn(kernel: Any, readings: tuple[Tensor, ...], first_index: Any, *parameters: Any) -> Tensor:
@@ -235,10 +257,14 @@ def _drawn(kernel: Any, readings: tuple[Tensor, ...], first_index: Any, *paramet
     for values in readings:
         if not isinstance(values, Tensor) or values.dtype not in (torch.float32, torch.float64):
             kind = values.dtype if isinstance(values, Tensor) else type(values).__name__
-            raise TypeError(f"readings must be float32 or float64 tensors, got {kind}: use .float() or .double()")
+            raise TypeError(
+                f"readings must be float32 or float64 tensors, got {kind}: use .float() or "
+                ".double()"
+            )
         if values.shape != like.shape or values.dtype != like.dtype or not values.ndim:
             raise ValueError(
-                f"readings must have one shape (..., n) and one dtype, got {tuple(values.shape)} {values.dtype} beside "
+                f"readings must have one shape (..., n) and one dtype, got {tuple(values.shape)} "
+                f"{values.dtype} beside "
                 f"{tuple(like.shape)} {like.dtype}"
             )
     shape = like.shape
@@ -255,44 +281,57 @@ def poisson(mean: Tensor, first_index: Any, seed: int, scale: float = 1.0) -> Te
 
     Args:
         mean: ``(..., n)`` float32 or float64 expectations ≥ 0 on the CPU.
-        first_index: ``(...)`` whole numbers, the global index of the first reading of each row of ``n``.
+        first_index: ``(...)`` whole numbers, the global index of the first reading of each row of
+            ``n``.
         seed: realisation number, ≥ 0.
         scale: factor on ``mean`` (exposure).
 
     Returns:
-        Tensor of the shape and dtype of ``mean``. A negative, infinite or NaN expectation gives NaN. From 10¹² counts
-        on the numbers are normal ones, rounded.
+        Tensor of the shape and dtype of ``mean``. A negative, infinite or NaN expectation gives
+        NaN. From 10¹² counts on the numbers are normal ones, rounded.
 
     Raises:
-        TypeError, ValueError: a seed that is no whole number ≥ 0, indices that do not match ``mean``, a mean of another
-            kind, a scale that is negative or not finite.
+        TypeError, ValueError: a seed that is no whole number ≥ 0, indices that do not match
+            ``mean``, a mean of another kind, a scale that is negative or not finite.
     """
-    return _drawn(_poisson_rows, (mean,), first_index, number("scale", scale, low=0.0), seed_key(seed))
+    return _drawn(
+        _poisson_rows, (mean,), first_index, number("scale", scale, low=0.0), seed_key(seed)
+    )
 
 
 def compound_poisson(
-    mean: Tensor, quantum: Tensor, first_index: Any, seed: int, scale: float = 1.0, electronic: float = 0.0
+    mean: Tensor,
+    quantum: Tensor,
+    first_index: Any,
+    seed: int,
+    scale: float = 1.0,
+    electronic: float = 0.0,
 ) -> Tensor:
-    """Signal of an energy-integrating detector: energies of a Poisson number of quanta, and electronic noise.
+    """Signal of an energy-integrating detector: energies of a Poisson number of quanta, and
+    electronic noise.
 
-    With N(E) Poisson quanta of signal s(E), a reading Σ s(E) N(E) has the mean m = Σ s N̄ and the variance
-    v = Σ s² N̄ (a compound Poisson law). It is drawn as q · Poisson(m / q) with q = v / m, the signal of an average
-    quantum weighted by its signal: mean and variance are exact, readings are never negative and go to zero together
-    with their mean. The third cumulant comes out as v² / m, short of the true Σ s³ N̄ by the factor
-    Σ s² N̄ · Σ s² N̄ / (Σ s N̄ · Σ s³ N̄), which is 0.94 in air and 0.96 behind 24 cm of fat at 100 kVp.
+    With N(E) Poisson quanta of signal s(E), a reading Σ s(E) N(E) has the mean m = Σ s N̄ and the
+    variance v = Σ s² N̄ (a compound Poisson law). It is drawn as q · Poisson(m / q) with q = v / m,
+    the signal of an average quantum weighted by its signal: mean and variance are exact, readings
+    are never negative and go to zero together with their mean. The third cumulant comes out as v² /
+    m, short of the true Σ s³ N̄ by the factor Σ s² N̄ · Σ s² N̄ / (Σ s N̄ · Σ s³ N̄), which is 0.94
+    in air and 0.96 behind 24 cm of fat at 100 kVp.
 
     Args:
         mean: ``(..., n)`` float32 or float64 expectations ≥ 0 on the CPU.
         quantum: the shape of ``mean``, q > 0 in the unit of ``mean``.
-        first_index, seed, scale: as for :func:`poisson`; ``scale`` multiplies ``mean``, not ``quantum``.
-        electronic: standard deviation of normal noise added to every reading, in the unit of ``mean``.
+        first_index, seed, scale: as for :func:`poisson`; ``scale`` multiplies ``mean``, not
+            ``quantum``.
+        electronic: standard deviation of normal noise added to every reading, in the unit of
+            ``mean``.
 
     Returns:
-        Tensor of the shape and dtype of ``mean``; negative values only through ``electronic``. A negative or NaN
-        expectation, or q ≤ 0, gives NaN.
+        Tensor of the shape and dtype of ``mean``; negative values only through ``electronic``. A
+        negative or NaN expectation, or q ≤ 0, gives NaN.
 
     Raises:
-        TypeError, ValueError: as :func:`poisson`; a ``quantum`` of another shape; ``electronic`` < 0.
+        TypeError, ValueError: as :func:`poisson`; a ``quantum`` of another shape; ``electronic`` <
+            0.
     """
     _like("quantum", quantum, "mean", mean)
     number("electronic", electronic, low=0.0)
@@ -305,18 +344,25 @@ def compound_poisson(
 
 
 def thinned(
-    counts: Tensor, first_index: Any, seed: int, fraction: float, quantum: Tensor | None = None, electronic: float = 0.0
+    counts: Tensor,
+    first_index: Any,
+    seed: int,
+    fraction: float,
+    quantum: Tensor | None = None,
+    electronic: float = 0.0,
 ) -> Tensor:
     """Counts at a fraction of the dose: each event stays with that probability (binomial thinning).
 
-    Of Poisson counts of mean λ the result is Poisson of mean ``fraction`` · λ, exactly. Readings that are no whole
-    number of quanta are rounded up or down at random first. The signal of an energy-integrating detector is thinned as
-    if all its quanta had the one size ``quantum``, and electronic noise is added until it is what it was: mean and
-    variance are right, higher moments are approximate.
+    Of Poisson counts of mean λ the result is Poisson of mean ``fraction`` · λ, exactly. Readings
+    that are no whole number of quanta are rounded up or down at random first. The signal of an
+    energy-integrating detector is thinned as if all its quanta had the one size ``quantum``, and
+    electronic noise is added until it is what it was: mean and variance are right, higher moments
+    are approximate.
 
     Args:
         counts: ``(..., n)`` noisy readings, float32 or float64, on the CPU.
-        first_index: ``(...)`` whole numbers, the global index of the first reading of each row of ``n``.
+        first_index: ``(...)`` whole numbers, the global index of the first reading of each row of
+            ``n``.
         seed: realisation number, ≥ 0.
         fraction: in (0, 1].
         quantum: the shape of ``counts``; None: 1.
@@ -326,8 +372,8 @@ def thinned(
         Shape and dtype of ``counts``; NaN where the counts are not finite.
 
     Raises:
-        TypeError, ValueError: as :func:`poisson`; a fraction outside of (0, 1], a ``quantum`` of another shape or
-            dtype, ``electronic`` < 0.
+        TypeError, ValueError: as :func:`poisson`; a fraction outside of (0, 1], a ``quantum`` of
+            another shape or dtype, ``electronic`` < 0.
     """
     fraction = number("fraction", fraction, positive=True, high=1.0)
     number("electronic", electronic, low=0.0)
@@ -338,13 +384,19 @@ def thinned(
     if quantum is not None:
         out *= quantum
     if electronic:
-        added = normal(tuple(counts.shape), first_index, seed, counts.dtype, purpose=_THINNED_ELECTRONICS)
+        added = normal(
+            tuple(counts.shape), first_index, seed, counts.dtype, purpose=_THINNED_ELECTRONICS
+        )
         out.add_(added, alpha=float(electronic) * math.sqrt(1.0 - fraction**2))
     return out
 
 
 def normal(
-    shape: tuple[int, ...], first_index: Any, seed: int, dtype: torch.dtype = torch.float32, purpose: int = _QUANTA
+    shape: tuple[int, ...],
+    first_index: Any,
+    seed: int,
+    dtype: torch.dtype = torch.float32,
+    purpose: int = _QUANTA,
 ) -> Tensor:
     """Standard normal numbers keyed like :func:`poisson`; ``shape`` is ``(..., n)``."""
     out = torch.empty((math.prod(shape[:-1]), shape[-1]), dtype=dtype)

@@ -19,20 +19,23 @@ from torchpcct.vector_geometry import VectorGeometry, check_motion
 __all__ = ["NOISE_MARGIN_COLUMNS", "DetectorWindow", "footprint"]
 
 NOISE_MARGIN_COLUMNS = 128
-"""Columns kept on either side of a region's footprint. The ramp filter reaches further, but its tail falls as 1 / n²:
-noise beyond 128 columns adds less than 1 % to the spectrum of the filtered noise at the lowest frequency that a
-1 mm ROI can tell from zero."""
+"""Columns kept on either side of a region's footprint. The ramp filter reaches further, but its
+tail falls as 1 / n²: noise beyond 128 columns adds less than 1 % to the spectrum of the filtered
+noise at the lowest frequency that a 1 mm ROI can tell from zero."""
 
 
 @dataclass(frozen=True, eq=False)
 class DetectorWindow:
-    """The part of a detector that matters: the same number of columns in every view, starting where the view says.
+    """The part of a detector that matters: the same number of columns in every view, starting where
+    the view says.
 
-    A small inset far from the isocentre is seen by a few per cent of the cells; its window follows it around
-    the turn. Data on a window have the shape ``(..., views, rows, columns)`` (2-D: ``(..., views, columns)``).
+    A small inset far from the isocentre is seen by a few per cent of the cells; its window follows
+    it around the turn. Data on a window have the shape ``(..., views, rows, columns)`` (2-D:
+    ``(..., views, columns)``).
 
     Args:
-        first_column: ``(views,)`` int64, index of the window's first column in each view (0 ≤ first).
+        first_column: ``(views,)`` int64, index of the window's first column in each view (0 ≤
+            first).
         columns: number of columns, the same in all views.
         first_row, rows: the rows kept, the same in all views (2-D geometries: 0 and 1).
     """
@@ -45,7 +48,10 @@ class DetectorWindow:
     def __post_init__(self) -> None:
         given = np.asarray(self.first_column)
         if given.dtype.kind not in "iu" or given.ndim != 1 or given.size == 0 or given.min() < 0:
-            raise ValueError(f"first_column must be a 1-D array of whole numbers ≥ 0, one per view, got {given!r:.80}")
+            raise ValueError(
+                "first_column must be a 1-D array of whole numbers ≥ 0, one per view, got "
+                f"{given!r:.80}"
+            )
         first = given.astype(np.int64)
         first.setflags(write=False)
         object.__setattr__(self, "first_column", first)
@@ -55,7 +61,8 @@ class DetectorWindow:
     def __eq__(self, other: object) -> bool:
         return (
             isinstance(other, DetectorWindow)
-            and (self.columns, self.first_row, self.rows) == (other.columns, other.first_row, other.rows)
+            and (self.columns, self.first_row, self.rows)
+            == (other.columns, other.first_row, other.rows)
             and np.array_equal(self.first_column, other.first_column)
         )
 
@@ -77,15 +84,16 @@ class DetectorWindow:
         return self.first_column[:, None] + np.arange(self.columns)
 
     def take(self, cells: Tensor) -> Tensor:
-        """What each reading of the window has at its cell: ``(..., rows, columns)`` of the whole detector to
-        ``(..., views, rows, columns)``."""
+        """What each reading of the window has at its cell: ``(..., rows, columns)`` of the whole
+        detector to ``(..., views, rows, columns)``."""
         kept = cells[..., self.first_row : self.first_row + self.rows, :]
         # Views first, as they lie in memory, and whole runs of columns at a time.
         runs = kept.unfold(-1, self.columns, 1).movedim(-2, -3)
         return runs.index_select(-3, torch.from_numpy(self.first_column.copy()).to(cells.device))
 
     def crop(self, values: Tensor, inner: DetectorWindow) -> Tensor:
-        """The readings of a smaller window: ``(..., views, rows, columns)`` on this window to those on ``inner``.
+        """The readings of a smaller window: ``(..., views, rows, columns)`` on this window to those
+        on ``inner``.
 
         Raises:
             ValueError: ``inner`` reaches beyond this window.
@@ -99,12 +107,17 @@ class DetectorWindow:
         return values.gather(-1, index)
 
     def check(self, geometry: Geometry, name: str = "the window") -> None:
-        """Raise ``ValueError`` unless this is a part of the detector of ``geometry`` in each of its views."""
+        """Raise ``ValueError`` unless this is a part of the detector of ``geometry`` in each of
+        its views."""
         if self.views != geometry.views:
-            raise ValueError(f"{name} has {self.views} views, but the geometry has {geometry.views}")
+            raise ValueError(
+                f"{name} has {self.views} views, but the geometry has {geometry.views}"
+            )
         whole = DetectorWindow.full(geometry)
         if not whole.holds(self):
-            raise ValueError(f"{name} reaches beyond the detector of {whole.rows} rows × {whole.columns} columns")
+            raise ValueError(
+                f"{name} reaches beyond the detector of {whole.rows} rows × {whole.columns} columns"
+            )
 
     @staticmethod
     def full(geometry: Geometry) -> DetectorWindow:
@@ -123,24 +136,30 @@ class DetectorWindow:
         return DetectorWindow(np.minimum(first, columns - width), width, first_row, rows)
 
     def widened(self, margin: int, outer: DetectorWindow) -> DetectorWindow:
-        """This window with ``margin`` more columns on either side and all rows, as far as ``outer`` goes."""
+        """This window with ``margin`` more columns on either side and all rows, as far as
+        ``outer`` goes."""
         width = min(self.columns + 2 * margin, outer.columns)
         last = outer.first_column + outer.columns - width
         first = np.clip(self.first_column - margin, outer.first_column, last)
         return DetectorWindow(first, width, outer.first_row, outer.rows)
 
     def within(self, outer: DetectorWindow) -> DetectorWindow:
-        """This window, its columns moved into ``outer`` (and cut to its width), its rows cut to those of ``outer``.
+        """This window, its columns moved into ``outer`` (and cut to its width), its rows cut to
+        those of ``outer``.
 
         Raises:
             ValueError: no row in common.
         """
         columns = min(self.columns, outer.columns)
-        first = np.clip(self.first_column, outer.first_column, outer.first_column + outer.columns - columns)
+        first = np.clip(
+            self.first_column, outer.first_column, outer.first_column + outer.columns - columns
+        )
         row = max(self.first_row, outer.first_row)
         rows = min(self.first_row + self.rows, outer.first_row + outer.rows) - row
         if rows < 1:
-            raise ValueError("no detector row of the window sees the grid: move the grid or widen the window")
+            raise ValueError(
+                "no detector row of the window sees the grid: move the grid or widen the window"
+            )
         return DetectorWindow(first, columns, row, rows)
 
     def with_rows(self, first_row: int, rows: int) -> DetectorWindow:
@@ -148,7 +167,8 @@ class DetectorWindow:
         return DetectorWindow(self.first_column, self.columns, first_row, rows)
 
     def select(self, views: Any) -> DetectorWindow:
-        """The same window for a subset (or reordering) of the views: an index array, mask or slice."""
+        """The same window for a subset (or reordering) of the views: an index array, mask or
+        slice."""
         return DetectorWindow(self.first_column[views], self.columns, self.first_row, self.rows)
 
     def holds(self, inner: DetectorWindow) -> bool:
@@ -164,7 +184,9 @@ class DetectorWindow:
 
 
 @checked
-def footprint(geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: Any = None) -> DetectorWindow:
+def footprint(
+    geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: Any = None
+) -> DetectorWindow:
     """The smallest window that sees every voxel corner of ``grid`` in every view.
 
     Args:
@@ -174,8 +196,8 @@ def footprint(geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: Any
         motion: displacement of the grid per view as for ``Projector``, or None.
 
     Raises:
-        ValueError: a motion of the wrong shape, the grid leaves the field of view, no row sees it, or the source's
-            orbit crosses it; a geometry given by vectors.
+        ValueError: a motion of the wrong shape, the grid leaves the field of view, no row sees it,
+            or the source's orbit crosses it; a geometry given by vectors.
     """
     if isinstance(geometry, VectorGeometry):
         raise ValueError("a scan given view by view has no windows: use all of its detector")
@@ -184,7 +206,11 @@ def footprint(geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: Any
     hy, hx = grid.extent[-2] / 2, grid.extent[-1] / 2
     corners = np.array([(cx + sx * hx, cy + sy * hy) for sx in (-1, 1) for sy in (-1, 1)])
     beta = geometry.angles[:, None]
-    shift = np.zeros((geometry.views, grid.ndim)) if motion is None else check_motion(motion, geometry.views, grid.ndim)
+    shift = (
+        np.zeros((geometry.views, grid.ndim))
+        if motion is None
+        else check_motion(motion, geometry.views, grid.ndim)
+    )
     x, y = corners[:, 0] + shift[:, -1:], corners[:, 1] + shift[:, -2:-1]  # (views, 4)
     along = x * np.cos(beta) + y * np.sin(beta)  # (views, 4), towards the source
     across = -x * np.sin(beta) + y * np.cos(beta)
@@ -195,7 +221,8 @@ def footprint(geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: Any
         depth = geometry.sod - along
         if depth.min() <= 0:
             raise ValueError(
-                f"the grid reaches {grid.in_plane_radius:.1f} mm from the axis, beyond the source orbit "
+                f"the grid reaches {grid.in_plane_radius:.1f} mm from the axis, beyond the source "
+                "orbit "
                 f"(sod {geometry.sod} mm): move or shrink the grid"
             )
         if geometry.detector == "curved":
@@ -204,15 +231,25 @@ def footprint(geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: Any
             position = geometry.sdd * across / depth
         pitch = geometry.pitch if isinstance(geometry, FanBeam) else geometry.pitch[1]
         if isinstance(geometry, ConeBeam):
-            reach = np.array([grid.center[0] - gz, grid.center[0] + gz]) if grid.ndim == 3 else np.zeros(2)
-            # On a curved detector the height follows the slant in-plane distance, on a flat one the depth.
+            reach = (
+                np.array([grid.center[0] - gz, grid.center[0] + gz])
+                if grid.ndim == 3
+                else np.zeros(2)
+            )
+            # On a curved detector the height follows the slant in-plane distance, on a flat one the
+            # depth.
             distance = np.hypot(across, depth) if geometry.detector == "curved" else depth
-            v = geometry.sdd * (reach[:, None, None] + (shift[:, :1] if grid.ndim == 3 else 0.0)) / distance
+            v = (
+                geometry.sdd
+                * (reach[:, None, None] + (shift[:, :1] if grid.ndim == 3 else 0.0))
+                / distance
+            )
             row0 = (v.min() - geometry.row_positions[0]) / geometry.pitch[0] - 0.5
             row1 = (v.max() - geometry.row_positions[0]) / geometry.pitch[0] + 0.5
             if row1 < 0.0 or row0 > geometry.rows - 1:
                 raise ValueError(
-                    f"the grid (z = {reach[0]:g} … {reach[1]:g} mm) lies above or below all {geometry.rows} rows in "
+                    f"the grid (z = {reach[0]:g} … {reach[1]:g} mm) lies above or below all "
+                    f"{geometry.rows} rows in "
                     "every view: move it along z"
                 )
             first_row = int(np.clip(math.floor(row0), 0, geometry.rows - 1))
@@ -223,7 +260,8 @@ def footprint(geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: Any
     low, high = index.min(axis=1), index.max(axis=1)
     if low.min() < -0.5 - 1e-9 or high.max() > geometry.columns - 0.5 + 1e-9:
         raise ValueError(
-            f"the grid (centre x {cx:g}, y {cy:g} mm, {grid.extent[-1]:g} × {grid.extent[-2]:g} mm) leaves the field "
+            f"the grid (centre x {cx:g}, y {cy:g} mm, {grid.extent[-1]:g} × {grid.extent[-2]:g} "
+            "mm) leaves the field "
             f"of view of {geometry.columns} columns in some views: move or shrink it"
         )
     first = np.floor(low + 0.5 - 1e-9).astype(np.int64) - margin

@@ -1,4 +1,5 @@
-"""Atomic writes, and HDF5 files that name the software that wrote them and are refused when damaged or foreign."""
+"""Atomic writes, and HDF5 files that name the software that wrote them and are refused when
+damaged or foreign."""
 
 from __future__ import annotations
 
@@ -46,7 +47,8 @@ __all__ = [
 ]
 
 LEFTOVER = re.compile(r"\.(?P<process>\d+)-(?P<machine>[0-9a-f]{6})-[0-9a-f]{8}\.part\.")
-"""Names of what is being written begin so: the process, where it runs, and a number of this write alone."""
+"""Names of what is being written begin so: the process, where it runs, and a number of this
+write alone."""
 _BLOCK = 512
 _ABANDONED_S = 60.0
 _MAGIC = b"torchpcct, HDF5 from byte 512, SHA-256 of it: "
@@ -57,9 +59,11 @@ VERSION = "0.2.0"
 
 
 def speak_any_encoding() -> None:
-    """Let standard output and error replace what the terminal's encoding lacks, instead of ending the program.
+    """Let standard output and error replace what the terminal's encoding lacks, instead of ending
+    the program.
 
-    Containers and cron speak ASCII, Windows code pages: a line with µ, ± or an ellipsis must not cost the result.
+    Containers and cron speak ASCII, Windows code pages: a line with µ, ± or an ellipsis must not
+    cost the result.
     """
     for stream in (sys.stdout, sys.stderr):
         encoding = (getattr(stream, "encoding", None) or "utf-8").lower().replace("-", "")
@@ -71,12 +75,14 @@ def require_folder(path: str | os.PathLike[str]) -> None:
     """Raise ``FileNotFoundError`` unless the folder that ``path`` would be written to exists."""
     parent = Path(path).parent
     if not parent.is_dir():
-        raise FileNotFoundError(f"cannot write {path}: the folder {parent} does not exist, create it first")
+        raise FileNotFoundError(
+            f"cannot write {path}: the folder {parent} does not exist, create it first"
+        )
 
 
 def require_ordinary(path: str | os.PathLike[str]) -> None:
-    """Raise ``ValueError`` if a path is a device, a pipe or a socket, which may never end, or never begin; of a folder,
-    if anything in it is. Links count as what they lead to.
+    """Raise ``ValueError`` if a path is a device, a pipe or a socket, which may never end, or never
+    begin; of a folder, if anything in it is. Links count as what they lead to.
 
     A path that is not there passes: whoever opens it says so.
     """
@@ -110,18 +116,23 @@ def require_writable(folder: str | os.PathLike[str]) -> None:
         with tempfile.TemporaryFile(dir=path):
             pass
     except OSError as error:
-        raise type(error)(f"cannot write into {path} ({error.strerror or error}): name another folder") from error
+        raise type(error)(
+            f"cannot write into {path} ({error.strerror or error}): name another folder"
+        ) from error
 
 
 class WriteError(OSError):
-    """A file could not be written, say to a full disk; nothing of it is left, and what was there before is."""
+    """A file could not be written, say to a full disk; nothing of it is left, and what was there
+    before is."""
 
 
 def _write_error(path: Path, cause: Exception) -> WriteError:
     """In one sentence: libraries make pages of the system's error, with its words somewhere."""
     text = str(cause).strip()
     number = getattr(cause, "errno", None)
-    number = number or next((n for n in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) if os.strerror(n) in text), None)
+    number = number or next(
+        (n for n in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) if os.strerror(n) in text), None
+    )
     why = os.strerror(number) if number else (text.splitlines() or [type(cause).__name__])[0]
     error = WriteError(f"cannot write {path}: {why}")
     error.errno = number
@@ -144,7 +155,8 @@ def _part(target: Path, process: int) -> Path:
 
 
 def abandoned(part: Path, seconds: float = 0.0) -> bool:
-    """Whether the writer of a temporary file is dead, by all that can be known here: that of another machine is not.
+    """Whether the writer of a temporary file is dead, by all that can be known here: that of
+    another machine is not.
 
     Args:
         part: temporary file or folder; of any other name it is none.
@@ -173,12 +185,13 @@ def _remove(path: Path) -> None:
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary name beside ``path``, for a file or a folder; flush what is there to the disk, rename it.
+    """Yield a temporary name beside ``path``, for a file or a folder; flush what is there to the
+    disk, rename it.
 
-    Whoever reads ``path`` at any moment, also after a crash, finds the old content or the new one, whole; so do any
-    number of processes and threads that write it at once. On any failure what is temporary is removed; what a killed
-    process left is removed by the next write of the same name, a minute later. A folder takes the place of none, or of
-    an empty one.
+    Whoever reads ``path`` at any moment, also after a crash, finds the old content or the new one,
+    whole; so do any number of processes and threads that write it at once. On any failure what is
+    temporary is removed; what a killed process left is removed by the next write of the same name,
+    a minute later. A folder takes the place of none, or of an empty one.
 
     Raises:
         FileNotFoundError: the folder of ``path`` does not exist.
@@ -207,7 +220,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def marker(folder: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a new empty file in a folder, by which other machines see that the disk is the same; gone after the block.
+    """Yield a new empty file in a folder, by which other machines see that the disk is the same;
+    gone after the block.
 
     What a killed process left is removed by the next one.
     """
@@ -223,7 +237,8 @@ def marker(folder: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 class _Unfailing(io.FileIO):
-    """A file for HDF5, which crashes when it closes a file that it could not write, or at the end of the program.
+    """A file for HDF5, which crashes when it closes a file that it could not write, or at the end
+    of the program.
 
     The first failure is kept in ``failure``; all that is written after it goes nowhere.
     """
@@ -255,14 +270,18 @@ class _Unfailing(io.FileIO):
 
 @contextmanager
 def _signals_wait() -> Iterator[None]:
-    """Put off what Python does at signals (Ctrl-C) to the end of a block: an exception in the middle of what HDF5 asks
-    of a file would lose a write silently."""
+    """Put off what Python does at signals (Ctrl-C) to the end of a block: an exception in the
+    middle of what HDF5 asks of a file would lose a write silently."""
     if threading.current_thread() is not threading.main_thread():
         yield  # Python serves signals in the main thread only
         return
     came: list[tuple[int, Any]] = []
     found = {int(n): signal.getsignal(n) for n in signal.valid_signals()}
-    handlers = {n: handler for n, handler in found.items() if callable(handler) and not isinstance(handler, int)}
+    handlers = {
+        n: handler
+        for n, handler in found.items()
+        if callable(handler) and not isinstance(handler, int)
+    }
     try:
         for n in handlers:
             signal.signal(n, lambda number, frame: came.append((number, frame)))
@@ -276,11 +295,12 @@ def _signals_wait() -> Iterator[None]:
 
 @contextmanager
 def write_hdf5(path: str | os.PathLike[str], kind: str) -> Iterator[Any]:
-    """Yield a new HDF5 file of the format ``torchpcct-KIND``, written whole or not at all and sealed.
+    """Yield a new HDF5 file of the format ``torchpcct-KIND``, written whole or not at all and
+    sealed.
 
-    HDF5 checks neither its data nor its structure, and a damaged structure can make it wait forever. So the first 512
-    bytes, which HDF5 leaves to the user, hold the SHA-256 of all the others: :func:`read_hdf5` compares it before HDF5
-    sees the file.
+    HDF5 checks neither its data nor its structure, and a damaged structure can make it wait
+    forever. So the first 512 bytes, which HDF5 leaves to the user, hold the SHA-256 of all the
+    others: :func:`read_hdf5` compares it before HDF5 sees the file.
 
     Raises:
         FileNotFoundError: the folder of ``path`` does not exist.
@@ -292,8 +312,14 @@ def write_hdf5(path: str | os.PathLike[str], kind: str) -> Iterator[Any]:
         with _signals_wait(), _Unfailing(part, "w+b") as raw:
             try:
                 with h5py.File(raw, "w", userblock_size=_BLOCK) as file:
-                    cache = file.id.get_mdc_config()  # no structure is thrown out, to be read back from nowhere
-                    cache.evictions_enabled, cache.incr_mode, cache.flash_incr_mode, cache.decr_mode = False, 0, 0, 0
+                    # no structure is thrown out, to be read back from nowhere
+                    cache = file.id.get_mdc_config()
+                    (
+                        cache.evictions_enabled,
+                        cache.incr_mode,
+                        cache.flash_incr_mode,
+                        cache.decr_mode,
+                    ) = False, 0, 0, 0
                     file.id.set_mdc_config(cache)
                     file.attrs["format"] = f"torchpcct-{kind}"
                     yield file
@@ -321,7 +347,8 @@ def is_sealed(path: str | os.PathLike[str]) -> bool:
 
 
 def fingerprint(path: str | os.PathLike[str]) -> str:
-    """SHA-256 of a file, or of the names and contents of all files of a folder, in the order of their names."""
+    """SHA-256 of a file, or of the names and contents of all files of a folder, in the order of
+    their names."""
     given = Path(path)
     if not given.is_dir():
         with given.open("rb") as content:
@@ -355,20 +382,23 @@ def _check_seal(path: str | os.PathLike[str], kind: str) -> None:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     if head != (_MAGIC + digest.encode() + b"\n").ljust(_BLOCK, b"\0"):
         raise ValueError(
-            f"{path} is truncated or damaged: its content does not have the checksum that it was written with; take "
+            f"{path} is truncated or damaged: its content does not have the checksum that it was "
+            "written with; take "
             "another copy of it, or make it again"
         )
 
 
 @contextmanager
 def read_hdf5(path: str | os.PathLike[str], kind: str) -> Iterator[Any]:
-    """Open an HDF5 file whose attribute ``format`` is ``torchpcct-KIND``, for a block that reads it.
+    """Open an HDF5 file whose attribute ``format`` is ``torchpcct-KIND``, for a block that reads
+    it.
 
     The checksum of a file of :func:`write_hdf5` is verified before.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: the file is truncated, altered, of another format, or the block does not find what it looks for.
+        ValueError: the file is truncated, altered, of another format, or the block does not find
+            what it looks for.
     """
     import h5py
 
@@ -381,7 +411,8 @@ def read_hdf5(path: str | os.PathLike[str], kind: str) -> Iterator[Any]:
             yield file
     except FileNotFoundError:
         raise
-    except Exception as error:  # a damaged file without checksum can make h5py, or what is built from it, fail anyhow
+    # a damaged file without checksum can make h5py, or what is built from it, fail anyhow
+    except Exception as error:
         if isinstance(error, ValueError) and str(path) in str(error):
             raise
         raise ValueError(
@@ -390,7 +421,8 @@ def read_hdf5(path: str | os.PathLike[str], kind: str) -> Iterator[Any]:
 
 
 def _sync(path: Path) -> None:
-    # A rename can reach the disk before the content does: without this, a power cut may leave an empty file.
+    # A rename can reach the disk before the content does: without this, a power cut may leave an
+    # empty file.
     if LEFTOVER.match(path.name) and path.is_dir():
         for inside in path.iterdir():
             _sync(inside)
@@ -405,11 +437,13 @@ def _sync(path: Path) -> None:
 
 
 _FIRST_MEMBER = (30, b"key.npy")
-"""Where the name of a ZIP archive's first file stands, and which it is in a piece: by it a damaged one is known."""
+"""Where the name of a ZIP archive's first file stands, and which it is in a piece: by it a
+damaged one is known."""
 
 
 def is_foreign(path: Path) -> bool:
-    """Whether something is there that is no piece (:mod:`recon.evaluate.store`), not even a damaged or older one."""
+    """Whether something is there that is no piece (:mod:`recon.evaluate.store`), not even a
+    damaged or older one."""
     try:
         if path.is_symlink() or not path.is_file():
             return path.is_symlink() or path.exists()

@@ -5,9 +5,9 @@ Conventions (one page, used everywhere in the package)
 * Index ``k`` of ``n`` sits at ``(k - (n - 1) / 2) * pitch + offset``.
 * ``e_r(β) = (cos β, sin β)``, ``e_t(β) = (-sin β, cos β)``; β grows counter-clockwise.
 * The source of view β is at ``sod * e_r(β)``; columns grow along ``+e_t``, rows along ``+z``.
-* A flat detector has its centre at ``-(sdd - sod) * e_r``. A curved detector lies on an arc of radius
-  ``sdd`` about the source: column ``u`` (mm along the arc) is seen at the fan angle ``γ = u / sdd``.
-  Its rows stand parallel to z (a cylinder segment).
+* A flat detector has its centre at ``-(sdd - sod) * e_r``. A curved detector lies on an arc of
+  radius ``sdd`` about the source: column ``u`` (mm along the arc) is seen at the fan angle ``γ = u
+  / sdd``. Its rows stand parallel to z (a cylinder segment).
 * A parallel ray of column ``u`` runs along ``-e_r`` through ``u * e_t``.
 * Volumes are ``(..., z, y, x)`` (2-D ``(..., y, x)``), line integrals ``(..., view, row, column)``
   (2-D ``(..., view, column)``).
@@ -26,36 +26,54 @@ from numpy.typing import NDArray
 
 from torchpcct.validate import checked, choice, number, per_axis, whole
 
-__all__ = ["ConeBeam", "FanBeam", "Geometry", "ParallelBeam", "VolumeGrid", "full_turn", "view_step"]
+__all__ = [
+    "ConeBeam",
+    "FanBeam",
+    "Geometry",
+    "ParallelBeam",
+    "VolumeGrid",
+    "full_turn",
+    "view_step",
+]
 
 Floats = NDArray[np.float64]
 
-_DEGREES_SPAN_RAD, _DEGREES_STEP_RAD = 20.0, 0.04
-"""Angles over more than three turns in steps of 2.3° and more: 20 and more degrees, up to 9000 views a turn, taken as
-rad. Helical scans of as many turns have far smaller steps."""
+_DEGREES_SPAN_RAD = 20.0
+_DEGREES_STEP_RAD = 0.04
+"""Angles over more than three turns in steps of 2.3° and more: 20 and more degrees, up to 9000
+views a turn, taken as rad. Helical scans of as many turns have far smaller steps."""
 
 
 @checked
 def full_turn(views: int, start: float = 0.0) -> Floats:
-    """``views`` equally spaced source angles over 2π, ``(views,)`` rad float64, the first at ``start``."""
+    """``views`` equally spaced source angles over 2π, ``(views,)`` rad float64, the first at
+    ``start``."""
     return np.arange(whole("views", views), dtype=np.float64) * (2.0 * math.pi / views) + start
 
 
 def _angles(value: Any) -> Floats:
     try:
         given = np.asarray(value)
-        if given.dtype.kind not in "fiu":  # numpy would drop an imaginary part, and take None for NaN
+        # numpy would drop an imaginary part, and take None for NaN
+        if given.dtype.kind not in "fiu":
             raise TypeError
         angles = np.array(given, dtype=np.float64)
     except (TypeError, ValueError):
-        raise TypeError(f"angles must be real numbers in rad, got {type(value).__name__}: {value!r:.60}") from None
+        raise TypeError(
+            f"angles must be real numbers in rad, got {type(value).__name__}: {value!r:.60}"
+        ) from None
     if angles.ndim != 1 or angles.size == 0:
-        raise ValueError(f"angles must be a non-empty 1-D sequence in rad, got shape {angles.shape}")
+        raise ValueError(
+            f"angles must be a non-empty 1-D sequence in rad, got shape {angles.shape}"
+        )
     if not np.isfinite(angles).all():
-        raise ValueError(f"angles must be finite, but view {int(np.argmin(np.isfinite(angles)))} is not")
+        raise ValueError(
+            f"angles must be finite, but view {int(np.argmin(np.isfinite(angles)))} is not"
+        )
     if np.ptp(angles) > _DEGREES_SPAN_RAD and view_step(angles) > _DEGREES_STEP_RAD:
         warnings.warn(
-            f"the angles cover {np.ptp(angles) / (2 * math.pi):.0f} turns in steps of {view_step(angles):.3g} rad: "
+            f"the angles cover {np.ptp(angles) / (2 * math.pi):.0f} turns in steps of "
+            f"{view_step(angles):.3g} rad: "
             "they look like degrees; give rad (numpy.deg2rad), or angles modulo 2π if they are rad",
             UserWarning,
             stacklevel=4,
@@ -65,7 +83,8 @@ def _angles(value: Any) -> Floats:
 
 
 def view_step(angles: Floats) -> float:
-    """The usual angle between neighbouring views in rad, whatever their order; 0 for fewer than two distinct views.
+    """The usual angle between neighbouring views in rad, whatever their order; 0 for fewer than two
+    distinct views.
 
     Args:
         angles: ``(views,)`` rad. Views closer than 1e-9 rad are repetitions of one view.
@@ -80,18 +99,24 @@ def _axis(count: int, pitch: float, offset: float) -> Floats:
 
 
 def _short(name: str, value: Any) -> str:
-    """A value in one line: of many angles the first and the last in degrees, of other arrays the shape."""
+    """A value in one line: of many angles the first and the last in degrees, of other arrays the
+    shape."""
     if name == "angles":
-        ends = f"{math.degrees(value[0]):.5g}°" + (f" … {math.degrees(value[-1]):.5g}°" if value.size > 1 else "")
+        ends = f"{math.degrees(value[0]):.5g}°" + (
+            f" … {math.degrees(value[-1]):.5g}°" if value.size > 1 else ""
+        )
         return f"{value.size} views, {ends}" if value.size > 1 else ends
-    return f"array{value.shape}" if isinstance(value, np.ndarray) and value.size > 4 else repr(value)
+    return (
+        f"array{value.shape}" if isinstance(value, np.ndarray) and value.size > 4 else repr(value)
+    )
 
 
 G = TypeVar("G", bound="Geometry")
 
 
 class Geometry:
-    """What all scan geometries share: ``angles`` (rad), equality by value, view subsets and scaling."""
+    """What all scan geometries share: ``angles`` (rad), equality by value, view subsets and
+    scaling."""
 
     angles: Floats
     columns: int
@@ -112,7 +137,8 @@ class Geometry:
         return len(self.shape) == 3
 
     def select(self: G, views: Any) -> G:
-        """The same scanner with a subset (or reordering) of the views: an index array, mask or slice."""
+        """The same scanner with a subset (or reordering) of the views: an index array, mask or
+        slice."""
         return replace(self, angles=self.angles[views])  # type: ignore[type-var]
 
     def _key(self) -> tuple[Any, ...]:
@@ -121,7 +147,9 @@ class Geometry:
 
     def __repr__(self) -> str:
         values = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
-        return f"{type(self).__name__}({', '.join(f'{n}={_short(n, v)}' for n, v in values.items())})"
+        return (
+            f"{type(self).__name__}({', '.join(f'{n}={_short(n, v)}' for n, v in values.items())})"
+        )
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Geometry) and self._key() == other._key()
@@ -138,7 +166,8 @@ class ParallelBeam(Geometry):
         angles: view angles β, ``(views,)`` rad. Rays of a view run along ``-e_r(β)``.
         columns: detector cells per view.
         pitch: cell width in mm.
-        offset: position of the detector's centre along ``e_t``, in mm (a quarter column: ``pitch / 4``).
+        offset: position of the detector's centre along ``e_t``, in mm (a quarter column: ``pitch /
+            4``).
 
     Raises:
         ValueError: a count < 1, a length ≤ 0, a non-finite or empty value.
@@ -189,7 +218,8 @@ class _Divergent(Geometry):
             half = (self.columns * pitch / 2 + abs(offset)) / self.sdd
             if half >= math.pi / 2:
                 raise ValueError(
-                    f"a curved detector of {self.columns} columns × {pitch} mm at sdd {self.sdd} mm spans a half-fan "
+                    f"a curved detector of {self.columns} columns × {pitch} mm at sdd {self.sdd} "
+                    "mm spans a half-fan "
                     f"of {math.degrees(half):.1f}°, 90° or more: reduce columns or pitch"
                 )
 
@@ -200,7 +230,8 @@ class _Divergent(Geometry):
 
     @property
     def column_positions(self) -> Floats:
-        """Cell centres along the detector (flat: along ``e_t``; curved: along the arc), ``(columns,)`` mm."""
+        """Cell centres along the detector (flat: along ``e_t``; curved: along the arc),
+        ``(columns,)`` mm."""
         raise NotImplementedError
 
     @property
@@ -211,7 +242,8 @@ class _Divergent(Geometry):
 
     @property
     def fov_radius(self) -> float:
-        """Radius in mm of the disc about the isocentre that every view sees whole (outer cell edges)."""
+        """Radius in mm of the disc about the isocentre that every view sees whole (outer cell
+        edges)."""
         u = self.column_positions
         pitch = self.pitch[1] if isinstance(self.pitch, tuple) else self.pitch
         half_pitch = 0.5 * (u[-1] - u[0]) / (self.columns - 1) if self.columns > 1 else 0.5 * pitch
@@ -234,7 +266,8 @@ class FanBeam(_Divergent):
         detector: ``"flat"`` or ``"curved"`` (arc about the source).
 
     Raises:
-        ValueError: a count < 1, a length ≤ 0, ``sdd <= sod``, an unknown detector, a half-fan of 90° or more.
+        ValueError: a count < 1, a length ≤ 0, ``sdd <= sod``, an unknown detector, a half-fan of
+            90° or more.
         TypeError: a value of the wrong kind.
     """
 
@@ -272,7 +305,8 @@ class ConeBeam(_Divergent):
         detector: ``"flat"`` or ``"curved"`` (arc about the source, rows parallel to z).
 
     Raises:
-        ValueError: a count < 1, a length ≤ 0, ``sdd <= sod``, an unknown detector, a half-fan of 90° or more.
+        ValueError: a count < 1, a length ≤ 0, ``sdd <= sod``, an unknown detector, a half-fan of
+            90° or more.
         TypeError: a value of the wrong kind.
     """
 
@@ -288,7 +322,9 @@ class ConeBeam(_Divergent):
     def __post_init__(self) -> None:
         self._validate_divergent()
         object.__setattr__(self, "rows", whole("rows", self.rows))
-        object.__setattr__(self, "pitch", per_axis("pitch", self.pitch, 2, positive=True, unit="mm"))
+        object.__setattr__(
+            self, "pitch", per_axis("pitch", self.pitch, 2, positive=True, unit="mm")
+        )
         object.__setattr__(self, "offset", per_axis("offset", self.offset, 2, unit="mm"))
         self._validate_arc(self.pitch[1], self.offset[1])
 
@@ -306,14 +342,23 @@ class ConeBeam(_Divergent):
         return _axis(self.rows, self.pitch[0], self.offset[0])
 
     def with_rows(self, first: int, rows: int) -> ConeBeam:
-        """The same beam on ``rows`` rows, the first of which is row ``first`` of this detector, at their places."""
+        """The same beam on ``rows`` rows, the first of which is row ``first`` of this detector,
+        at their places."""
         shift = (first + 0.5 * (rows - self.rows)) * self.pitch[0]
         return replace(self, rows=rows, offset=(self.offset[0] + shift, self.offset[1]))
 
     @property
     def central_fan(self) -> FanBeam:
         """The fan beam of the plane z = 0."""
-        return FanBeam(self.angles, self.sod, self.sdd, self.columns, self.pitch[1], self.offset[1], self.detector)
+        return FanBeam(
+            self.angles,
+            self.sod,
+            self.sdd,
+            self.columns,
+            self.pitch[1],
+            self.offset[1],
+            self.detector,
+        )
 
 
 @dataclass(frozen=True)
@@ -323,7 +368,8 @@ class VolumeGrid:
     Args:
         shape: ``(y, x)`` or ``(z, y, x)`` voxel counts.
         spacing: voxel size in mm, one number or one per axis in the order of ``shape``.
-        center: position of the grid's centre in mm, one number or one per axis in the order of ``shape``.
+        center: position of the grid's centre in mm, one number or one per axis in the order of
+            ``shape``.
 
     Raises:
         ValueError: a count < 1, a spacing ≤ 0, a wrong number of axes.
@@ -340,31 +386,40 @@ class VolumeGrid:
         if not isinstance(self.shape, Sequence) or isinstance(self.shape, str):
             raise TypeError(f"shape must be (y, x) or (z, y, x), got {self.shape!r}")
         if len(self.shape) not in (2, 3):
-            raise ValueError(f"shape must have 2 or 3 axes, (y, x) or (z, y, x), got {self.shape!r}")
+            raise ValueError(
+                f"shape must have 2 or 3 axes, (y, x) or (z, y, x), got {self.shape!r}"
+            )
         set_(self, "shape", tuple(whole(f"shape[{i}]", n) for i, n in enumerate(self.shape)))
         set_(self, "ndim", len(self.shape))
-        set_(self, "spacing", per_axis("spacing", self.spacing, self.ndim, positive=True, unit="mm"))
+        set_(
+            self, "spacing", per_axis("spacing", self.spacing, self.ndim, positive=True, unit="mm")
+        )
         set_(self, "center", per_axis("center", self.center, self.ndim, unit="mm"))
 
     @classmethod
     @checked
-    def of(cls, scan: Any, *, voxel: float | None = None, extent: Any = None, center: Any = None) -> VolumeGrid:
+    def of(
+        cls, scan: Any, *, voxel: float | None = None, extent: Any = None, center: Any = None
+    ) -> VolumeGrid:
         """The grid of what a scan sees.
 
-        A scan that was acquired for a region (:func:`torchpcct.acquire`) gives that region. Of an earlier file, which
-        does not say for which, and of a part of a scan (:meth:`torchpcct.Scan.crop`): a box that all views see. Of a
-        whole detector: the square about the field of view, of a cone beam as high as all views see it.
+        A scan that was acquired for a region (:func:`torchpcct.acquire`) gives that region. Of an
+        earlier file, which does not say for which, and of a part of a scan
+        (:meth:`torchpcct.Scan.crop`): a box that all views see. Of a whole detector: the square
+        about the field of view, of a cone beam as high as all views see it.
 
         Args:
-            scan: a :class:`torchpcct.Scan`, or the :class:`recon.analytic.slabs.ScanSlices` of a file.
-            voxel: edge length in mm; None: of the region's voxels, or, of a whole detector and of a region given as
-                one voxel, of a detector cell as it is seen at the axis.
-            extent: edge lengths in mm: z, y, x of a scan with rows, y, x of slices, which are those of the readings.
-                None: all that is seen.
+            scan: a :class:`torchpcct.Scan`, or the :class:`recon.analytic.slabs.ScanSlices` of a
+                file.
+            voxel: edge length in mm; None: of the region's voxels, or, of a whole detector and of a
+                region given as one voxel, of a detector cell as it is seen at the axis.
+            extent: edge lengths in mm: z, y, x of a scan with rows, y, x of slices, which are those
+                of the readings. None: all that is seen.
             center: in mm, z, y, x, or y, x of slices. None: of what is seen.
 
         Raises:
-            ValueError: values out of range, another number of axes, a part of a detector that sees no box in all views.
+            ValueError: values out of range, another number of axes, a part of a detector that sees
+                no box in all views.
         """
         found: VolumeGrid = scan.seen_grid(voxel, extent, center)
         return found
@@ -372,7 +427,9 @@ class VolumeGrid:
     @property
     def axes(self) -> tuple[Floats, ...]:
         """Voxel centres per axis in mm, in the order of ``shape``."""
-        return tuple(_axis(n, s, c) for n, s, c in zip(self.shape, self.spacing, self.center, strict=True))
+        return tuple(
+            _axis(n, s, c) for n, s, c in zip(self.shape, self.spacing, self.center, strict=True)
+        )
 
     @property
     def extent(self) -> tuple[float, ...]:

@@ -1,8 +1,9 @@
-"""What numba keeps of compiled kernels: a message before it compiles, and kernels older than a function they hold.
+"""What numba keeps of compiled kernels: a message before it compiles, and kernels older than a
+function they hold.
 
-A kernel holds the compiled code of all functions it calls, but numba's cache looks at the kernel's own file only. Where
-one of them, in another file, is edited or updated in place (``git pull`` of an editable installation), the cache would
-go on giving the old code, silently.
+A kernel holds the compiled code of all functions it calls, but numba's cache looks at the kernel's
+own file only. Where one of them, in another file, is edited or updated in place (``git pull`` of an
+editable installation), the cache would go on giving the old code, silently.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ def sources(name: str, *constants: str) -> set[Path]:
 
     Args:
         name: of an imported module.
-        constants: names of modules whose constants its kernels hold, of which numba keeps no record.
+        constants: names of modules whose constants its kernels hold, of which numba keeps no
+            record.
     """
     found: set[str] = set()
     _follow(sys.modules[name], found)
@@ -46,12 +48,17 @@ def _follow(module: ModuleType, found: set[str]) -> None:
     for value in list(vars(module).values()):
         inner = getattr(value, "__wrapped__", None)  # numba's functions wrap Python's
         other = getattr(inner, "__module__", "") or ""
-        if other.startswith(OURS) and type(value).__module__.startswith("numba.") and other in sys.modules:
+        if (
+            other.startswith(OURS)
+            and type(value).__module__.startswith("numba.")
+            and other in sys.modules
+        ):
             _follow(sys.modules[other], found)
 
 
 def forget_outdated(name: str, *constants: str) -> int:
-    """Forget a module's compiled kernels where they are older than a function they call; to be called at its end.
+    """Forget a module's compiled kernels where they are older than a function they call; to be
+    called at its end.
 
     Args:
         name, constants: as for :func:`sources`.
@@ -61,7 +68,9 @@ def forget_outdated(name: str, *constants: str) -> int:
     """
     module = sys.modules[name]
     # A file from the future (a wrong clock) would have the kernels compiled by every process.
-    newest = max((t for t in map(_changed, sources(name, *constants)) if t <= time.time()), default=0.0)
+    newest = max(
+        (t for t in map(_changed, sources(name, *constants)) if t <= time.time()), default=0.0
+    )
     forgotten = 0
     for folder in folders(name):
         for index in Path(folder).glob(f"{Path(str(module.__file__)).stem}.*.nbi"):
@@ -76,7 +85,9 @@ def forget_outdated(name: str, *constants: str) -> int:
 
 def folders(name: str) -> set[str]:
     """Where the compiled code of an imported module's kernels lies."""
-    kernels = [v for v in vars(sys.modules[name]).values() if getattr(v, "__module__", None) == name]
+    kernels = [
+        v for v in vars(sys.modules[name]).values() if getattr(v, "__module__", None) == name
+    ]
     found = {getattr(getattr(kernel, "stats", None), "cache_path", None) for kernel in kernels}
     return {path for path in found if path is not None}
 
@@ -87,7 +98,8 @@ def _changed(path: Path) -> float:
 
 @cache
 def announce_compilation() -> None:
-    """From now on, log a warning when the first kernel of the package is compiled rather than read from the cache."""
+    """From now on, log a warning when the first kernel of the package is compiled rather than
+    read from the cache."""
     from numba.core import event
 
     class Announce(event.Listener):
@@ -98,7 +110,8 @@ def announce_compilation() -> None:
             if not self.announced and getattr(function, "__module__", "").startswith(OURS):
                 Announce.announced = True
                 logging.getLogger(__name__).warning(
-                    "compiling kernels for this processor: this call takes up to a minute longer, later ones read them "
+                    "compiling kernels for this processor: this call takes up to a minute longer, "
+                    "later ones read them "
                     "from numba's cache"
                 )
 
@@ -108,16 +121,18 @@ def announce_compilation() -> None:
     event.register("numba:compile", Announce())
 
 
-# --- processes that need the same kernel ------------------------------------------------------------------------------
+# --- processes that need the same kernel ----------------------------------------------------------
 
 
 @contextmanager
 def compiled_once(patience_s: float = 60.0) -> Iterator[None]:
-    """Of the processes of a machine that are in such a block one compiles a kernel; the others read it from the cache.
+    """Of the processes of a machine that are in such a block one compiles a kernel; the others read
+    it from the cache.
 
-    Each kernel has a lock of its own, so that nobody waits for a kernel that he does not need. All waits of a block
-    together last ``patience_s`` at most; then, and where no lock can be had (no folder of one's own, a disk without
-    locks), a process compiles for itself: that takes time, and the result is the same.
+    Each kernel has a lock of its own, so that nobody waits for a kernel that he does not need. All
+    waits of a block together last ``patience_s`` at most; then, and where no lock can be had (no
+    folder of one's own, a disk without locks), a process compiles for itself: that takes time, and
+    the result is the same.
     """
     from filelock import BaseFileLock, FileLock, Timeout
     from numba.core import caching, event
@@ -182,15 +197,22 @@ def compiled_once(patience_s: float = 60.0) -> Iterator[None]:
 
 
 def _lock_folder() -> Path | None:
-    """In the user's own cache, made if need be, where nobody else can put a file or a link; None: there is none."""
+    """In the user's own cache, made if need be, where nobody else can put a file or a link;
+    None: there is none."""
     local = os.environ.get("LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME", "")
     with suppress(OSError, RuntimeError):  # not writable; no home
-        folder = (Path(local) if os.path.isabs(local) else Path.home() / ".cache") / "torchpcct" / "locks"
+        folder = (
+            (Path(local) if os.path.isabs(local) else Path.home() / ".cache")
+            / "torchpcct"
+            / "locks"
+        )
         for part in (folder.parent, folder):
             part.mkdir(mode=0o700, parents=True, exist_ok=True)
             found = part.lstat()
             # On Windows the profile's own rights keep others out, and these numbers say nothing.
-            mine = not hasattr(os, "getuid") or (found.st_uid == os.getuid() and not found.st_mode & 0o022)
+            mine = not hasattr(os, "getuid") or (
+                found.st_uid == os.getuid() and not found.st_mode & 0o022
+            )
             if part.is_symlink() or not mine:
                 return None
         return folder

@@ -1,8 +1,9 @@
-"""From the raw readings of any scanner to what a :class:`torchpcct.scan.Scan` holds: dark, gain, air, dead cells.
+"""From the raw readings of any scanner to what a :class:`torchpcct.scan.Scan` holds: dark, gain,
+air, dead cells.
 
-Called by ``Scan.from_counts`` and ``Scan.from_line_integrals``. What a scan makes of its readings is here, too:
-weights, the bias of the logarithm, and :func:`bridge`, which interpolates dead readings from their neighbours, so that
-they do not spread over the image.
+Called by ``Scan.from_counts`` and ``Scan.from_line_integrals``. What a scan makes of its readings
+is here, too: weights, the bias of the logarithm, and :func:`bridge`, which interpolates dead
+readings from their neighbours, so that they do not spread over the image.
 """
 
 from __future__ import annotations
@@ -36,19 +37,23 @@ __all__ = [
 ]
 
 _PSEUDO_DEPTH = 5.0
-"""Line integral through as much water as all columns see at the axis, where a scan is not in HU. The attenuation that
-so stands for water (0.02 mm⁻¹ where they see 25 cm) sets the scale of priors, nothing else; it scales as lengths do."""
+"""Line integral through as much water as all columns see at the axis, where a scan is not in HU.
+The attenuation that so stands for water (0.02 mm⁻¹ where they see 25 cm) sets the scale of priors,
+nothing else; it scales as lengths do."""
 _SILENT_VIEWS = 8
 """Cells that read nothing in so many views, or more, are dead."""
 _DARK = 1e-3
 """Cells that read no more in air than this share of the median cell are dead."""
-FEWEST, MANY = 0.3, 10.0
+FEWEST = 0.3
+MANY = 10.0
 """Expected counts between which the logarithm is corrected: see :func:`log_bias`."""
 _AVERAGED = 10.0
 """Readings that :func:`smoothed` averages over in effect, of a sinogram; of a cone beam 26."""
-_FEW, _NO_PHOTONS, _NO_COUNTS = 1000.0, 0.1, 2.0
-"""Readings in air below which half a photon matters; variance over mean below which what was read are no photons;
-readings in air that cannot be counts: transmissions."""
+_FEW = 1000.0
+_NO_PHOTONS = 0.1
+_NO_COUNTS = 2.0
+"""Readings in air below which half a photon matters; variance over mean below which what was read
+are no photons; readings in air that cannot be counts: transmissions."""
 DIM = 20.0
 """Photons of a reading below which its noise is far from normal."""
 TRANSFER_FRAMES = 4
@@ -73,7 +78,9 @@ def _tensor(name: str, values: Any) -> Tensor:
         return values.detach().to("cpu", torch.float32)
     array = np.asarray(values)
     if array.dtype.kind not in "biuf":
-        raise TypeError(f"{name} must be an array of real numbers, got {type(values).__name__} of {array.dtype}")
+        raise TypeError(
+            f"{name} must be an array of real numbers, got {type(values).__name__} of {array.dtype}"
+        )
     return torch.from_numpy(np.array(array, dtype=np.float32, order="C"))
 
 
@@ -102,7 +109,9 @@ def _shapes(name: str, readings: Tensor, geometry: Geometry) -> tuple[int, ...]:
     return (*readings.shape[:-axes], *geometry.shape[1:])
 
 
-def _correction(linearisation: Any, geometry: Geometry, mu_water: float | None) -> tuple[WaterLinearisation, str]:
+def _correction(
+    linearisation: Any, geometry: Geometry, mu_water: float | None
+) -> tuple[WaterLinearisation, str]:
     """The map of line integrals, and the unit of volumes."""
     columns = geometry.columns
     if mu_water is None:
@@ -112,10 +121,16 @@ def _correction(linearisation: Any, geometry: Geometry, mu_water: float | None) 
     unit = "mm^-1" if mu_water is None else "HU"
     if isinstance(linearisation, WaterLinearisation):
         if linearisation.scale.size != columns:
-            raise ValueError(f"linearisation has {linearisation.scale.size} columns, the detector {columns}")
+            raise ValueError(
+                f"linearisation has {linearisation.scale.size} columns, the detector {columns}"
+            )
         return linearisation, "HU"
-    if linearisation is not None and (not isinstance(linearisation, Sequence) or isinstance(linearisation, str)):
-        raise TypeError(f"linearisation must be None, coefficients c₁, c₂, …, or a map, got {linearisation!r}")
+    if linearisation is not None and (
+        not isinstance(linearisation, Sequence) or isinstance(linearisation, str)
+    ):
+        raise TypeError(
+            f"linearisation must be None, coefficients c₁, c₂, …, or a map, got {linearisation!r}"
+        )
     coefficients = (1.0,) if linearisation is None else tuple(linearisation)
     return WaterLinearisation.polynomial(coefficients, columns, mu), unit
 
@@ -126,7 +141,8 @@ def _views(cells: Tensor, geometry: Geometry) -> Tensor:
 
 
 def _dead(mask: Any, readings: Tensor, air: Tensor, geometry: Geometry) -> Tensor:
-    """Dead readings, ``readings.shape`` or the shape of one frame with an axis of views of length 1."""
+    """Dead readings, ``readings.shape`` or the shape of one frame with an axis of views of
+    length 1."""
     cells = tuple(air.shape)
     # Of a cell without signal the mean over frames is noise about 0, not 0.
     dead = _views(~(air > _DARK * air.nanmedian().clamp(min=0.0)) | ~torch.isfinite(air), geometry)
@@ -135,13 +151,18 @@ def _dead(mask: Any, readings: Tensor, air: Tensor, geometry: Geometry) -> Tenso
     if mask is not None:
         given = torch.as_tensor(np.asarray(mask))
         if given.dtype != torch.bool:
-            raise TypeError(f"dead must be a mask of bool, True where a cell is dead, got {given.dtype}")
+            raise TypeError(
+                f"dead must be a mask of bool, True where a cell is dead, got {given.dtype}"
+            )
         if given.shape == readings.shape:
             dead = dead | given
         elif given.ndim <= len(cells) and tuple(given.shape) == cells[len(cells) - given.ndim :]:
             dead = dead | _views(given.expand(cells), geometry)
         else:
-            raise ValueError(f"dead must have the shape {cells} or that of the readings, got {tuple(given.shape)}")
+            raise ValueError(
+                f"dead must have the shape {cells} or that of the readings, got "
+                f"{tuple(given.shape)}"
+            )
     bad = ~torch.isfinite(readings)
     return dead | bad if bool(bad.any()) else dead
 
@@ -153,9 +174,11 @@ def _photon_transfer(frames: Tensor, dark: Tensor) -> float | None:
     """
     signal = frames - dark
     level = signal.flatten(1).median(1).values
-    signal = signal / level.view(-1, *(1,) * (signal.ndim - 1)) * level.mean()  # the tube may have drifted
+    # the tube may have drifted
+    signal = signal / level.view(-1, *(1,) * (signal.ndim - 1)) * level.mean()
     mean = signal.mean(0)
-    # One degree of freedom goes into the mean; the median of a χ² of n - 1 degrees is below its mean.
+    # One degree of freedom goes into the mean; the median of a χ² of n - 1 degrees is below its
+    # mean.
     ratio = (signal.var(0) / mean)[mean > 0.2 * mean.median()]
     n = len(frames) - 1
     gain = float(ratio.median()) / (1.0 - 2.0 / (9.0 * n)) ** 3
@@ -163,14 +186,17 @@ def _photon_transfer(frames: Tensor, dark: Tensor) -> float | None:
 
 
 def _gain_of_noise(signal: Tensor, air: Tensor, geometry: Geometry) -> float:
-    """Signal per photon that explains the noise of the readings between neighbouring columns (:func:`_photons`)."""
+    """Signal per photon that explains the noise of the readings between neighbouring columns
+    (:func:`_photons`)."""
     level = _views(air, geometry)
     bad = ~((signal > 0) & (level > 0) & torch.isfinite(signal) & torch.isfinite(level))
     lines = torch.log(torch.where(bad, 1.0, level) / torch.where(bad, 1.0, signal))
     return float(air[air > 0].nanmedian()) / _photons(lines, bad, geometry)
 
 
-def _gain(given: Any, signal: Tensor, air: Tensor, frames: Tensor | None, dark: Tensor, geometry: Geometry) -> Any:
+def _gain(
+    given: Any, signal: Tensor, air: Tensor, frames: Tensor | None, dark: Tensor, geometry: Geometry
+) -> Any:
     """Signal of one photon, and where it is from; see ``Scan.from_counts``."""
     if given is None and (frames is None or len(frames) < TRANSFER_FRAMES):
         level = float(air.nanmedian())
@@ -221,7 +247,10 @@ def counted(
     bright = torch.where((bright > 0) & torch.isfinite(bright), bright, 1.0)
     low = float(counts.min())
     if low < 0 and not offset and not electronic_noise:
-        raise ValueError(f"counts must not be negative, the lowest is {low:g}: give dark=, or use from_line_integrals")
+        raise ValueError(
+            f"counts must not be negative, the lowest is {low:g}: give dark=, or use "
+            "from_line_integrals"
+        )
     correction, unit = _correction(linearisation, geometry, mu_water)
     integrating = offset or electronic_noise > 0
     fields: dict[str, Any] = {
@@ -247,28 +276,43 @@ def counted(
 def _flux(flux: Any, geometry: Geometry) -> Tensor:
     given = _tensor("flux", flux)
     if tuple(given.shape) != (geometry.views,):
-        raise ValueError(f"flux must have one number per view, ({geometry.views},), got {tuple(given.shape)}")
+        raise ValueError(
+            f"flux must have one number per view, ({geometry.views},), got {tuple(given.shape)}"
+        )
     if not bool(((given > 0) & torch.isfinite(given)).all()):
-        raise ValueError("flux must be finite and greater than 0 in every view: leave out views without beam")
+        raise ValueError(
+            "flux must be finite and greater than 0 in every view: leave out views without beam"
+        )
     return given
 
 
 def logged(
-    lines: Any, geometry: Geometry, photons: Any, dead: Any, linearisation: Any, mu_water: float | None
+    lines: Any,
+    geometry: Geometry,
+    photons: Any,
+    dead: Any,
+    linearisation: Any,
+    mu_water: float | None,
 ) -> dict[str, Any]:
     """Fields of a scan from line integrals; see ``Scan.from_line_integrals``."""
     p = _tensor("lines", lines)
     cells = _shapes("lines", p, geometry)
-    mask = _dead(dead, p + 1.0, torch.ones(cells), geometry)  # a line integral of 0 is air, not a silent cell
+    # a line integral of 0 is air, not a silent cell
+    mask = _dead(dead, p + 1.0, torch.ones(cells), geometry)
     p = p.masked_fill(mask, 0.0)
     low, high = float(p.min()), float(p.max())
     if high > _HIGHEST or low < -_HIGHEST:
         raise ValueError(
-            f"lines reach from {low:g} to {high:g}, no line integrals (−ln of the transmission): are they counts, "
+            f"lines reach from {low:g} to {high:g}, no line integrals (−ln of the transmission): "
+            "are they counts, "
             "percentages or HU? Use from_counts for readings"
         )
     estimated = photons is None
-    air = torch.tensor(_photons(p, mask, geometry)) if photons is None else _frame("photons", photons, cells)[0]
+    air = (
+        torch.tensor(_photons(p, mask, geometry))
+        if photons is None
+        else _frame("photons", photons, cells)[0]
+    )
     air = air.expand(cells).clone()
     if not bool(((air > 0) & torch.isfinite(air)).all()):
         raise ValueError("photons must be finite and greater than 0 in every cell")
@@ -294,12 +338,17 @@ _HIGHEST = 40.0
 def _photons(p: Tensor, mask: Tensor, geometry: Geometry) -> float:
     """Photons of an unattenuated reading that explain the noise between neighbouring columns.
 
-    The second difference of smooth rows is noise of variance 6 / N; with N = N₀ e^−p, its product with e^(−p/2) is
-    alike everywhere. Edges are outliers to the median. Noise-free data give a large number, at most 1e8.
+    The second difference of smooth rows is noise of variance 6 / N; with N = N₀ e^−p, its product
+    with e^(−p/2) is alike everywhere. Edges are outliers to the median. Noise-free data give a
+    large number, at most 1e8.
     """
     if p.shape[-1] < 8:
         return 1e6
-    second = (p[..., 2:] - 2.0 * p[..., 1:-1] + p[..., :-2]) * torch.exp(-0.5 * p[..., 1:-1]) / math.sqrt(6.0)
+    second = (
+        (p[..., 2:] - 2.0 * p[..., 1:-1] + p[..., :-2])
+        * torch.exp(-0.5 * p[..., 1:-1])
+        / math.sqrt(6.0)
+    )
     dead = mask.expand(p.shape)
     live = second[~(dead[..., 2:] | dead[..., 1:-1] | dead[..., :-2])]
     live = live[:: max(1, live.numel() // 1_000_000)]
@@ -310,11 +359,13 @@ def _photons(p: Tensor, mask: Tensor, geometry: Geometry) -> float:
 
 
 def dispersion(readings: Tensor, rows: bool) -> float:
-    """Variance over mean of the noise between neighbours: the reading of one photon; 1 of Poisson counts.
+    """Variance over mean of the noise between neighbours: the reading of one photon; 1 of Poisson
+    counts.
 
-    The second difference of smooth readings is noise of six times the variance. Edges are outliers to the median;
-    details everywhere raise it, so that the smaller one counts of those along the columns and along the views. Readings
-    of a handful of photons do not tell, and are left out, as those of 0.
+    The second difference of smooth readings is noise of six times the variance. Edges are outliers
+    to the median; details everywhere raise it, so that the smaller one counts of those along the
+    columns and along the views. Readings of a handful of photons do not tell, and are left out, as
+    those of 0.
 
     Args:
         readings: ``(..., views, [rows,] columns)``, the dark taken off.
@@ -336,7 +387,8 @@ def _dispersion(readings: Tensor) -> float:
     live = (n[:, 2:] > 0) & (n[:, 1:-1] > 0) & (n[:, :-2] > 0)
     del n
     level, ratio = level[live], second.square_().div_(6.0 * level)[live]
-    for _ in range(2):  # a first guess from all, then without the dim ones, whose noise is not normal
+    # a first guess from all, then without the dim ones, whose noise is not normal
+    for _ in range(2):
         if ratio.numel() < 8:
             return math.nan
         found = float(ratio.median()) * MEDIAN_TO_SD**2
@@ -346,17 +398,21 @@ def _dispersion(readings: Tensor) -> float:
 
 
 def inverse_variance(mean: Tensor, quantum: Tensor, electronic_noise: float) -> Tensor:
-    """Inverse variance of the logarithm of readings, by the delta method: mean² / (quantum · mean + electronic noise²).
+    """Inverse variance of the logarithm of readings, by the delta method: mean² / (quantum · mean +
+    electronic noise²).
 
     What a starved reading says is bounded by half a quantum, as its logarithm is.
     """
     mean = mean.clamp(min=0.0)
-    return mean.square().div_(torch.maximum(mean * quantum + electronic_noise**2, quantum * quantum / 2))
+    return mean.square().div_(
+        torch.maximum(mean * quantum + electronic_noise**2, quantum * quantum / 2)
+    )
 
 
 @lru_cache(maxsize=1)
 def _log_bias() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """ln m, and what the logarithm of Poisson counts, E ln(n + ½), lies above it; from the sum over all n."""
+    """ln m, and what the logarithm of Poisson counts, E ln(n + ½), lies above it; from the sum
+    over all n."""
     m = np.geomspace(FEWEST, MANY, 200)
     n = np.arange(int(MANY + 12 * math.sqrt(MANY)))[:, None]
     factorial = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, len(n))))])[:, None]
@@ -367,11 +423,13 @@ def _log_bias() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 def log_bias(mean: Tensor) -> Tensor:
     """Mean of ln(n + ½) less the logarithm of the mean, of Poisson counts n.
 
-    0.03 at two counts, 0.17 at one, 0.8 at ``FEWEST``: it takes the darkest rays for brighter than they are.
+    0.03 at two counts, 0.17 at one, 0.8 at ``FEWEST``: it takes the darkest rays for brighter than
+    they are.
 
     Args:
-        mean: expected counts, estimated from some ten readings (:func:`smoothed`). Above ``MANY`` the bias is 0;
-            below ``FEWEST`` it is that of so many, for the estimate itself says no more.
+        mean: expected counts, estimated from some ten readings (:func:`smoothed`). Above ``MANY``
+            the bias is 0; below ``FEWEST`` it is that of so many, for the estimate itself says no
+            more.
     """
     known, bias = _log_bias()
     # The logarithm of the estimate is biased, too: ½ a count in those that it was made of.
@@ -382,10 +440,12 @@ def log_bias(mean: Tensor) -> Tensor:
 
 
 def smoothed(values: Tensor, dead: Tensor | None, rows: bool) -> Tensor:
-    """Mean over the neighbourhood of every reading, the dead left out: an estimate of the expected readings.
+    """Mean over the neighbourhood of every reading, the dead left out: an estimate of the expected
+    readings.
 
-    Binomial weights over five columns, three views and, of a cone beam, three rows. Weights made from a noisy reading
-    itself go up where the noise does and bias the result; the mean of 45 (15) readings hardly knows its own noise.
+    Binomial weights over five columns, three views and, of a cone beam, three rows. Weights made
+    from a noisy reading itself go up where the noise does and bias the result; the mean of 45 (15)
+    readings hardly knows its own noise.
 
     Args:
         values: ``(..., views, [rows,] columns)``.
@@ -409,25 +469,30 @@ def _filtered(values: Tensor, axis: int, weights: tuple[int, ...]) -> Tensor:
     out = torch.zeros_like(values)
     index = torch.arange(n)
     for k, w in enumerate(weights):
-        out.add_(values.index_select(axis, (index + k - half).clamp(0, n - 1)), alpha=w / sum(weights))
+        out.add_(
+            values.index_select(axis, (index + k - half).clamp(0, n - 1)), alpha=w / sum(weights)
+        )
     return out
 
 
 def bridge(lines: Tensor, dead: Tensor, rows: bool, most: float = MOST_DEAD) -> Tensor:
     """Replace dead readings by linear interpolation between the nearest live ones.
 
-    Along the columns of a row where live readings stand on both sides, else along the rows; beyond the outermost live
-    column (then row) its value is repeated. Views without any live reading are interpolated between the nearest live
-    ones, in the order given.
+    Along the columns of a row where live readings stand on both sides, else along the rows; beyond
+    the outermost live column (then row) its value is repeated. Views without any live reading are
+    interpolated between the nearest live ones, in the order given.
 
     Args:
         lines: ``(..., views, [rows,] columns)``.
         dead: bool of the same shape, or one that broadcasts to it.
-        rows: whether the last axis but one is the detector's rows (cone beams), so that a lost row can be bridged.
-        most: largest share of a view's readings that may be dead; 1: any, as long as a reading is left.
+        rows: whether the last axis but one is the detector's rows (cone beams), so that a lost row
+            can be bridged.
+        most: largest share of a view's readings that may be dead; 1: any, as long as a reading is
+            left.
 
     Returns:
-        Tensor of the shape and dtype of ``lines``: linear in the live readings, differentiable, and independent of
+        Tensor of the shape and dtype of ``lines``: linear in the live readings, differentiable, and
+            independent of
         what the dead ones hold.
 
     Raises:
@@ -439,16 +504,24 @@ def bridge(lines: Tensor, dead: Tensor, rows: bool, most: float = MOST_DEAD) -> 
     if float(share.max()) > most:
         worst = torch.unravel_index(share.argmax(), share.shape)
         raise ValueError(
-            f"{100 * float(share.max()):.0f} % of the readings of view {int(worst[-1])} are dead (NaN, Inf or masked), "
+            f"{100 * float(share.max()):.0f} % of the readings of view {int(worst[-1])} are dead "
+            "(NaN, Inf or masked), "
             f"at most {100 * most:.0f} % can be bridged: leave bad views out with geometry.select"
         )
     if bool(dead.all()):
         raise ValueError("no live reading is left: the scan cannot be used")
-    across = ((-1, True), (-2, True), (-1, False), (-2, False)) if rows else ((-1, True), (-1, False))
+    across = (
+        ((-1, True), (-2, True), (-1, False), (-2, False)) if rows else ((-1, True), (-1, False))
+    )
     view = -3 if rows else -2
-    # What a dead cell holds must not reach anything, not as 0 × NaN either. Block by block: indices need memory.
+    # What a dead cell holds must not reach anything, not as 0 × NaN either. Block by block: indices
+    # need memory.
     split = max(view, -lines.ndim)
-    step = lines.shape[split] if split != view else max(1, _BLOCK * lines.shape[view] // max(lines.numel(), 1))
+    step = (
+        lines.shape[split]
+        if split != view
+        else max(1, _BLOCK * lines.shape[view] // max(lines.numel(), 1))
+    )
     blocks = [
         _bridged_along(torch.where(d, 0.0, v), d, across)
         for v, d in zip(lines.split(step, split), dead.split(step, split), strict=True)
@@ -457,7 +530,9 @@ def bridge(lines: Tensor, dead: Tensor, rows: bool, most: float = MOST_DEAD) -> 
     return _bridged_along(values, left, ((view, True), (view, False)))[0]
 
 
-def _bridged_along(values: Tensor, dead: Tensor, axes: Sequence[tuple[int, bool]]) -> tuple[Tensor, Tensor]:
+def _bridged_along(
+    values: Tensor, dead: Tensor, axes: Sequence[tuple[int, bool]]
+) -> tuple[Tensor, Tensor]:
     """:func:`_bridged` along one axis after the other, until nothing is dead."""
     for axis, between in axes:
         if not bool(dead.any()):
@@ -473,7 +548,8 @@ def _bridged(values: Tensor, dead: Tensor, axis: int, between: bool) -> tuple[Te
         values: any shape, finite.
         dead: of the same shape.
         axis: of both.
-        between: only between two live readings; else beyond the outermost live one, too, which is repeated there.
+        between: only between two live readings; else beyond the outermost live one, too, which is
+            repeated there.
     """
     n = values.shape[axis]
     values, dead = values.movedim(axis, -1), dead.movedim(axis, -1).clone()

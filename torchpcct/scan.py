@@ -1,4 +1,5 @@
-"""A scan: what the detector read, what it reads in air, and how to turn the two into line integrals."""
+"""A scan: what the detector read, what it reads in air, and how to turn the two into line
+integrals."""
 
 from __future__ import annotations
 
@@ -33,39 +34,43 @@ class Scan:
     """Readings of one scan.
 
     Args:
-        counts: ``(views, rows, columns)``, spectral ``(bins, views, rows, columns)``, float32; of a detector
-            without rows ``(views, columns)`` or, of several slices, ``(slices, views, columns)``. Counts if noisy
-            (``exposure_s`` given); else expected counts for :data:`NOISE_FREE_EXPOSURE_S`. With a window, only its
-            cells: ``(..., views, window.rows, window.columns)``.
-        air: ``counts`` without the axis of views: expected readings without the object, same exposure.
+        counts: ``(views, rows, columns)``, spectral ``(bins, views, rows, columns)``, float32; of a
+            detector without rows ``(views, columns)`` or, of several slices, ``(slices, views,
+            columns)``. Counts if noisy (``exposure_s`` given); else expected counts for
+            :data:`NOISE_FREE_EXPOSURE_S`. With a window, only its cells: ``(..., views,
+            window.rows, window.columns)``.
+        air: ``counts`` without the axis of views: expected readings without the object, same
+            exposure.
         geometry: the scan geometry of the WHOLE detector.
         linearisation: water beam-hardening correction of the scanner.
         exposure_s: duration of the scan in s; None: noise free.
         seed: seed of the noise; None: noise free.
         window: the part of the detector that was kept; None: all of it.
-        surround: ``air``-shaped expected readings of every cell outside the window, the same in all views; given if
-            and only if ``window`` is.
-        counting: True: readings are photon counts with Poisson noise. False: an energy-integrating detector's signal.
+        surround: ``air``-shaped expected readings of every cell outside the window, the same in all
+            views; given if and only if ``window`` is.
+        counting: True: readings are photon counts with Poisson noise. False: an energy-integrating
+            detector's signal.
         info: provenance (scanner, plan, versions), JSON values.
-        quantum: energy integrating only: variance over expectation of every stored reading without electronic noise,
-            in keV (Σ s² N̄ / Σ s N̄ over the quanta that reach the detector behind the object), the shape of
-            ``counts``.
-            None: the noise of this signal is not known.
-        electronic_noise: energy integrating only: standard deviation in keV that the electronics add to every reading,
-            whatever the exposure.
+        quantum: energy integrating only: variance over expectation of every stored reading without
+            electronic noise, in keV (Σ s² N̄ / Σ s N̄ over the quanta that reach the detector
+            behind the object), the shape of ``counts``. None: the noise of this signal is not
+            known.
+        electronic_noise: energy integrating only: standard deviation in keV that the electronics
+            add to every reading, whatever the exposure.
         flux: ``(views,)`` relative intensity of the source in each view; None: the same in all.
-        dead: bool, the shape of ``counts``: readings that say nothing; None: there are none. They are bridged by their
-            neighbours in line integrals, and weigh nothing.
+        dead: bool, the shape of ``counts``: readings that say nothing; None: there are none. They
+            are bridged by their neighbours in line integrals, and weigh nothing.
         logged: the readings come from given line integrals: their logarithm is taken as it is.
-        unit: of volumes, "HU" or, where the attenuation of water is not known or means nothing, "mm^-1". "pixel^-1":
-            the size of a cell is not known, all lengths are in cells.
+        unit: of volumes, "HU" or, where the attenuation of water is not known or means nothing,
+            "mm^-1". "pixel^-1": the size of a cell is not known, all lengths are in cells.
 
-    Scans of other scanners: :meth:`from_counts`, :meth:`from_line_integrals`, :mod:`torchpcct.formats`.
+    Scans of other scanners: :meth:`from_counts`, :meth:`from_line_integrals`,
+    :mod:`torchpcct.formats`.
 
     Raises:
-        ValueError: NaN, Inf or negative counts, no counts at all, readings in air or of the surround that are NaN,
-            infinite or ≤ 0, an exposure ≤ 0, shapes that do not fit the geometry, a water correction of another
-            detector, a window beyond the detector.
+        ValueError: NaN, Inf or negative counts, no counts at all, readings in air or of the
+            surround that are NaN, infinite or ≤ 0, an exposure ≤ 0, shapes that do not fit the
+            geometry, a water correction of another detector, a window beyond the detector.
         TypeError: a member of the wrong kind.
     """
 
@@ -110,33 +115,50 @@ class Scan:
     ) -> Scan:
         """A scan from the readings of any detector.
 
-        ``(readings − dark) / gain`` are photons, with Poisson noise and the electronics'. Readings are dead if they are
-        NaN or Inf or ``dead`` says so; cells if they read nothing in all views, or no more in air than in the dark.
+        ``(readings − dark) / gain`` are photons, with Poisson noise and the electronics'. Readings
+        are dead if they are NaN or Inf or ``dead`` says so; cells if they read nothing in all
+        views, or no more in air than in the dark.
 
         Args:
             readings: raw, the shape of ``counts``, any real dtype.
             geometry: parallel, fan or cone beam, or view by view
                 (:class:`~torchpcct.vector_geometry.VectorGeometry`).
-            air: readings without the object: one frame, the shape of ``readings`` without views, or several
-                ``(frames, …)``, or one number.
+            air: readings without the object: one frame, the shape of ``readings`` without views, or
+                several ``(frames, …)``, or one number.
             dark: readings without beam, as ``air``.
-            gain: reading of one photon. None: from the variance of four air frames or more (photon transfer), else 1.
-                "noise", and None where the frames do not differ: what explains the noise between neighbouring columns.
-                None, and readings with far less noise than photons: they are transmissions; the same.
+            gain: reading of one photon. None: from the variance of four air frames or more (photon
+                transfer), else 1. "noise", and None where the frames do not differ: what explains
+                the noise between neighbouring columns. None, and readings with far less noise than
+                photons: they are transmissions; the same.
             flux: ``(views,)`` intensity of the source relative to ``air``; None: the same.
             dead: bool mask of cells or of readings, True where dead.
-            electronic_noise: standard deviation in photons; None: from three dark frames or more, else 0.
-            linearisation: None: line integrals as they are. ``(c₁, c₂, …)``: c₁ p + c₂ p² + …, a beam-hardening
-                correction. Or a :class:`~torchpcct.scanner.linearisation.WaterLinearisation`.
-            mu_water: attenuation of water in mm⁻¹ (0.02 for a clinical beam): volumes in HU. None: in mm⁻¹.
+            electronic_noise: standard deviation in photons; None: from three dark frames or more,
+                else 0.
+            linearisation: None: line integrals as they are. ``(c₁, c₂, …)``: c₁ p + c₂ p² + …, a
+                beam-hardening correction. Or a
+                :class:`~torchpcct.scanner.linearisation.WaterLinearisation`.
+            mu_water: attenuation of water in mm⁻¹ (0.02 for a clinical beam): volumes in HU. None:
+                in mm⁻¹.
             exposure_s: duration of the scan in s.
             info: provenance.
 
         Raises:
-            ValueError: shapes that do not fit, negative counts without ``dark``, values out of range.
+            ValueError: shapes that do not fit, negative counts without ``dark``, values out of
+                range.
             TypeError: values of the wrong kind.
         """
-        fields = counted(readings, geometry, air, dark, gain, flux, dead, electronic_noise, linearisation, mu_water)
+        fields = counted(
+            readings,
+            geometry,
+            air,
+            dark,
+            gain,
+            flux,
+            dead,
+            electronic_noise,
+            linearisation,
+            mu_water,
+        )
         fields["info"] |= dict(info or {})
         return cls(geometry=geometry, exposure_s=exposure_s, **fields)
 
@@ -159,12 +181,13 @@ class Scan:
         Args:
             lines: the shape of ``counts``; NaN and Inf are dead.
             geometry: as for :meth:`from_counts`.
-            photons: of an unattenuated reading, one number or one per cell; it sets the statistical weights. None:
-                estimated from the noise between neighbouring columns.
+            photons: of an unattenuated reading, one number or one per cell; it sets the statistical
+                weights. None: estimated from the noise between neighbouring columns.
             dead, linearisation, mu_water, exposure_s, info: of :meth:`from_counts`.
 
         Raises:
-            ValueError: shapes that do not fit, values that cannot be line integrals, values out of range.
+            ValueError: shapes that do not fit, values that cannot be line integrals, values out of
+                range.
             TypeError: values of the wrong kind.
         """
         fields = logged(lines, geometry, photons, dead, linearisation, mu_water)
@@ -175,9 +198,16 @@ class Scan:
         what = "line integrals" if self.logged else "counts" if self.counting else "readings"
         size = " × ".join(map(str, self.counts.shape))
         dead = 0 if self.dead is None else int(self.dead.sum())
-        noise = "noise free" if self.noise_free else f"{self.exposure_s:g} s, mean {float(self.counts.mean()):.4g}"
+        noise = (
+            "noise free"
+            if self.noise_free
+            else f"{self.exposure_s:g} s, mean {float(self.counts.mean()):.4g}"
+        )
         part = "" if self.window is None else ", a part of the detector"
-        return f"Scan({size} {what}, {noise}, {dead} dead{part}, volumes in {self.unit}\n     {self.geometry!r})"
+        return (
+            f"Scan({size} {what}, {noise}, {dead} dead{part}, volumes in {self.unit}\n     "
+            f"{self.geometry!r})"
+        )
 
     @property
     def noise_free(self) -> bool:
@@ -193,17 +223,20 @@ class Scan:
     def with_noise(self, exposure_s: float, seed: int) -> Scan:
         """A noisy realisation of a noise-free scan.
 
-        The noise of a reading depends only on ``seed`` and the reading's place on the full detector, so a windowed
-        scan carries the same noise as the full one. Counts are Poisson; an energy-integrating signal is compound
-        Poisson with the second moment of the transmitted spectrum (:func:`torchpcct.counting_noise.compound_poisson`),
-        and electronic noise is added.
+        The noise of a reading depends only on ``seed`` and the reading's place on the full
+        detector, so a windowed scan carries the same noise as the full one. Counts are Poisson; an
+        energy-integrating signal is compound Poisson with the second moment of the transmitted
+        spectrum (:func:`torchpcct.counting_noise.compound_poisson`), and electronic noise is added.
 
         Raises:
-            ValueError: the scan is noisy already; ``exposure_s`` ≤ 0; a negative seed; an energy-integrating scan that
-                does not hold ``quantum``.
+            ValueError: the scan is noisy already; ``exposure_s`` ≤ 0; a negative seed; an
+                energy-integrating scan that does not hold ``quantum``.
         """
         if not self.noise_free:
-            raise ValueError("with_noise needs a noise-free scan (acquire with exposure_s=None), this one is noisy")
+            raise ValueError(
+                "with_noise needs a noise-free scan (acquire with exposure_s=None), this one is "
+                "noisy"
+            )
         self._require_noise_model()
         check_exposure(exposure_s)
         scale = exposure_s / NOISE_FREE_EXPOSURE_S
@@ -211,7 +244,9 @@ class Scan:
         if self.quantum is None:
             readings = noise.poisson(self.counts, index, seed, scale)
         else:
-            readings = noise.compound_poisson(self.counts, self.quantum, index, seed, scale, self.electronic_noise)
+            readings = noise.compound_poisson(
+                self.counts, self.quantum, index, seed, scale, self.electronic_noise
+            )
         return replace(
             self,
             counts=readings,
@@ -223,35 +258,45 @@ class Scan:
 
     @checked
     def at_dose(self, fraction: float, seed: int = 0) -> Scan:
-        """The same scan as if it had been taken with a fraction of its dose: a measured scan, its noise included.
+        """The same scan as if it had been taken with a fraction of its dose: a measured scan, its
+        noise included.
 
-        Photon counts are thinned: each photon stays with the probability ``fraction``, which makes Poisson counts of
-        the lower dose exactly, whatever the object; every energy bin by itself. Air readings and exposure scale, dead
-        readings stay dead. Counts that are no whole numbers (a gain), line integrals of a known number of photons and
-        the signal of an energy-integrating detector get the right mean and variance
-        (:func:`torchpcct.counting_noise.thinned`), and ``info["lower_dose"]`` says that this is approximate.
+        Photon counts are thinned: each photon stays with the probability ``fraction``, which makes
+        Poisson counts of the lower dose exactly, whatever the object; every energy bin by itself.
+        Air readings and exposure scale, dead readings stay dead. Counts that are no whole numbers
+        (a gain), line integrals of a known number of photons and the signal of an
+        energy-integrating detector get the right mean and variance
+        (:func:`torchpcct.counting_noise.thinned`), and ``info["lower_dose"]`` says that this is
+        approximate.
 
         Args:
             fraction: of the dose, in (0, 1].
-            seed: realisation number, ≥ 0; a reading's noise depends on it and on the reading's place alone.
+            seed: realisation number, ≥ 0; a reading's noise depends on it and on the reading's
+                place alone.
 
         Raises:
-            ValueError: a noise-free scan; a fraction outside of (0, 1]; line integrals whose number of photons was not
-                given; an energy-integrating scan that does not hold ``quantum``.
+            ValueError: a noise-free scan; a fraction outside of (0, 1]; line integrals whose number
+                of photons was not given; an energy-integrating scan that does not hold ``quantum``.
         """
         fraction = number("fraction", fraction, positive=True, high=1.0)
         if self.noise_free:
             raise ValueError(
-                "at_dose thins noisy readings, and this scan is noise free: use with_noise(exposure_s, seed)"
+                "at_dose thins noisy readings, and this scan is noise free: use "
+                "with_noise(exposure_s, seed)"
             )
         if self.logged and self.info.get("photons") != "given":
             raise ValueError(
-                "these are line integrals of an unknown number of photons: give photons= where the scan is made, or "
+                "these are line integrals of an unknown number of photons: give photons= where "
+                "the scan is made, or "
                 "the raw counts"
             )
         self._require_noise_model()
-        readings = noise.thinned(self.counts, self._first_index(), seed, fraction, self.quantum, self.electronic_noise)
-        exact = self.counting and not self.logged and bool((self.counts == self.counts.round()).all())
+        readings = noise.thinned(
+            self.counts, self._first_index(), seed, fraction, self.quantum, self.electronic_noise
+        )
+        exact = (
+            self.counting and not self.logged and bool((self.counts == self.counts.round()).all())
+        )
         note = {"fraction": fraction, "seed": int(seed), "exact": exact}
         return replace(
             self,
@@ -264,7 +309,8 @@ class Scan:
         )
 
     def crop(self, window: DetectorWindow) -> Scan:
-        """The same scan on a part of its window; its noise is that of the whole. A smaller one has no region.
+        """The same scan on a part of its window; its noise is that of the whole. A smaller one has
+        no region.
 
         Raises:
             ValueError: the scan is not windowed, or ``window`` reaches beyond its window.
@@ -273,19 +319,28 @@ class Scan:
             raise ValueError("only a windowed scan can be cropped: acquire it with region=")
         outer = self.window
         region = self.region if window == outer else None
-        return replace(self, window=window, region=region, **self.each(lambda readings: outer.crop(readings, window)))
+        return replace(
+            self,
+            window=window,
+            region=region,
+            **self.each(lambda readings: outer.crop(readings, window)),
+        )
 
     def each(self, change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
-        """What has a value for each reading (``counts``, ``quantum``, ``dead``), changed alike; None stays."""
+        """What has a value for each reading (``counts``, ``quantum``, ``dead``), changed alike;
+        None stays."""
         held = {name: getattr(self, name) for name in ("counts", "quantum", "dead")}
         return {name: None if values is None else change(values) for name, values in held.items()}
 
-    def seen_grid(self, voxel: float | None = None, extent: Any = None, center: Any = None) -> VolumeGrid:
+    def seen_grid(
+        self, voxel: float | None = None, extent: Any = None, center: Any = None
+    ) -> VolumeGrid:
         """What :meth:`torchpcct.VolumeGrid.of` gives."""
         return grid_of(self, voxel, extent, center)
 
     def select(self, views: Any) -> Scan:
-        """The same scan with a subset (or reordering) of the views: an index array, mask or slice."""
+        """The same scan with a subset (or reordering) of the views: an index array, mask or
+        slice."""
         at = views if isinstance(views, slice) else torch.as_tensor(views)
         axes = (..., at, *(slice(None),) * (len(self.geometry.shape) - 1))
         return replace(
@@ -299,29 +354,37 @@ class Scan:
     def _require_noise_model(self) -> None:
         if not self.counting and self.quantum is None:
             raise ValueError(
-                "this energy-integrating scan does not hold the energy of its quanta, so its noise is not known: "
+                "this energy-integrating scan does not hold the energy of its quanta, so its "
+                "noise is not known: "
                 "simulate it with acquire(), or give quantum="
             )
 
     def relative_variance(self, exposure_s: float) -> Tensor:
-        """Variance over squared expectation of every reading at an exposure, shape and dtype of ``counts``.
+        """Variance over squared expectation of every reading at an exposure, shape and dtype of
+        ``counts``.
 
-        It is the variance of ``ln`` of the reading (delta method). Counting: 1 / N̄. Energy integrating:
-        q / S̄ + (electronic noise / S̄)².
+        It is the variance of ``ln`` of the reading (delta method). Counting: 1 / N̄. Energy
+        integrating: q / S̄ + (electronic noise / S̄)².
 
         Raises:
-            ValueError: the scan is noisy (its expectations are needed); ``exposure_s`` ≤ 0; an energy-integrating scan
-                that does not hold ``quantum``.
+            ValueError: the scan is noisy (its expectations are needed); ``exposure_s`` ≤ 0; an
+                energy-integrating scan that does not hold ``quantum``.
         """
         if not self.noise_free:
-            raise ValueError("the variance follows from expected readings: give the noise-free scan")
+            raise ValueError(
+                "the variance follows from expected readings: give the noise-free scan"
+            )
         number("exposure_s", exposure_s, positive=True, unit="s")
         self._require_noise_model()
         inverse = (self.counts * (exposure_s / NOISE_FREE_EXPOSURE_S)).reciprocal_()
         if self.quantum is None:
             return inverse
         variance = inverse * self.quantum
-        return variance.add_(inverse.mul_(self.electronic_noise).square_()) if self.electronic_noise else variance
+        return (
+            variance.add_(inverse.mul_(self.electronic_noise).square_())
+            if self.electronic_noise
+            else variance
+        )
 
     def _first_index(self) -> Any:
         """Global index of the first reading of every detector row held in ``counts``."""
@@ -334,20 +397,23 @@ class Scan:
         return (np.arange(bins)[:, None, None] * math.prod(g.shape) + index).reshape(-1)
 
     def _at_window(self, cells: Tensor) -> Tensor:
-        """``(..., rows, columns)`` values of the cells as seen by the stored readings, ``(..., views | 1, r, c)``."""
+        """``(..., rows, columns)`` values of the cells as seen by the stored readings, ``(...,
+        views | 1, r, c)``."""
         if self.window is None:
             return cells.unsqueeze(-len(self.geometry.shape))
         return self.window.take(cells)
 
     def line_integrals(self) -> Tensor:
-        """Water-linearised line integrals of the stored readings, shape and dtype of ``counts``, dimensionless.
+        """Water-linearised line integrals of the stored readings, shape and dtype of ``counts``,
+        dimensionless.
 
-        ``ln(air) − ln(counts + ½)`` for counts (½ removes the bias of the logarithm to second order in 1 / counts
-        and keeps zero counts finite; below three counts the rest follows from the neighbours' mean,
-        :func:`torchpcct.readings.log_bias`), ``ln(air) − ln(counts)`` for expectations; then the scanner's water
-        correction, so that a path through t mm of water reads ``mu_ref · t``. The shift of an energy-integrating signal
-        S is variance / (2 S) = q / 2 + electronic noise² / (2 S); starved readings are held at q / 2, which a counting
-        detector with quanta of q would read at zero counts.
+        ``ln(air) − ln(counts + ½)`` for counts (½ removes the bias of the logarithm to second order
+        in 1 / counts and keeps zero counts finite; below three counts the rest follows from the
+        neighbours' mean, :func:`torchpcct.readings.log_bias`), ``ln(air) − ln(counts)`` for
+        expectations; then the scanner's water correction, so that a path through t mm of water
+        reads ``mu_ref · t``. The shift of an energy-integrating signal S is variance / (2 S) = q /
+        2 + electronic noise² / (2 S); starved readings are held at q / 2, which a counting detector
+        with quanta of q would read at zero counts.
 
         Raises:
             ValueError: a noisy energy-integrating scan that does not hold ``quantum``.
@@ -371,7 +437,8 @@ class Scan:
         return smoothed(readings, self.dead, self.geometry.has_rows)
 
     def _logarithm(self) -> Tensor:
-        """``ln(air) − ln(readings)`` before the water correction; dead readings hold anything finite."""
+        """``ln(air) − ln(readings)`` before the water correction; dead readings hold anything
+        finite."""
         positive = self._positive()
         if self.dead is not None:
             positive.masked_fill_(self.dead, 1.0)
@@ -382,17 +449,23 @@ class Scan:
         return values.view(-1, *(1,) * (len(self.geometry.shape) - 1))
 
     def weights(self) -> Tensor:
-        """Statistical weights of :meth:`line_integrals`: inverse variances, shape and dtype of ``counts``.
+        """Statistical weights of :meth:`line_integrals`: inverse variances, shape and dtype of
+        ``counts``.
 
-        Of expected readings, not of the noisy ones, which would bias a weighted fit: the readings' local mean
-        (:func:`torchpcct.readings.smoothed`); expectations of a noise-free scan as they are. Dead readings weigh 0.
+        Of expected readings, not of the noisy ones, which would bias a weighted fit: the readings'
+        local mean (:func:`torchpcct.readings.smoothed`); expectations of a noise-free scan as they
+        are. Dead readings weigh 0.
 
         Raises:
             ValueError: an energy-integrating scan that does not hold ``quantum``.
         """
         self._require_noise_model()
         rows = self.geometry.has_rows
-        mean = self.counts if self.noise_free or self.window is not None else smoothed(self.counts, self.dead, rows)
+        mean = (
+            self.counts
+            if self.noise_free or self.window is not None
+            else smoothed(self.counts, self.dead, rows)
+        )
         quantum = torch.ones(1) if self.quantum is None else self.quantum
         p = (self._at_window(self.air) / torch.maximum(mean, quantum / 2)).log_()
         if self.flux is not None:
@@ -432,12 +505,13 @@ class Scan:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], slices: slice | None = None) -> Scan:
-        """Read a scan written by :meth:`save`; with ``slices`` no more than these slices, or rows of a cone beam.
+        """Read a scan written by :meth:`save`; with ``slices`` no more than these slices, or rows
+        of a cone beam.
 
         Raises:
             FileNotFoundError: no such file.
-            ValueError: the file is truncated or altered (its checksum is verified), is no torchpcct scan, or is of a
-                newer format.
+            ValueError: the file is truncated or altered (its checksum is verified), is no torchpcct
+                scan, or is of a newer format.
         """
         with read_hdf5(path, "scan") as file:
             return cls(**scan_fields(file, path, slices))
@@ -456,7 +530,9 @@ def _check(scan: Scan) -> None:
     g, w = scan.geometry, scan.window
     axes = len(g.shape)
     if w is not None and not isinstance(g, ConeBeam):
-        raise TypeError(f"geometry must be a ConeBeam in a scan with a window, got {type(g).__name__}")
+        raise TypeError(
+            f"geometry must be a ConeBeam in a scan with a window, got {type(g).__name__}"
+        )
     cells = g.shape if w is None else w.shape
     if tuple(scan.counts.shape[-axes:]) != cells or scan.counts.ndim not in (axes, axes + 1):
         raise ValueError(f"counts have shape {tuple(scan.counts.shape)}, expected (…, {cells})")
@@ -466,32 +542,51 @@ def _check(scan: Scan) -> None:
     if (w is None) != (scan.surround is None):
         raise ValueError("a windowed scan needs the readings of its surround, a full scan has none")
     if scan.region is not None and (w is None or scan.region.ndim != 3):
-        raise ValueError("region must be the (z, y, x) grid that a windowed scan was kept for; a full scan has none")
+        raise ValueError(
+            "region must be the (z, y, x) grid that a windowed scan was kept for; a full scan has "
+            "none"
+        )
     if w is not None:
         w.check(g)
     if scan.linearisation.scale.size != g.columns:
         raise ValueError(
-            f"the water correction is that of {scan.linearisation.scale.size} columns, the detector has {g.columns}"
+            f"the water correction is that of {scan.linearisation.scale.size} columns, the "
+            f"detector has {g.columns}"
         )
     if scan.surround is not None and scan.surround.shape != scan.air.shape:
-        raise ValueError(f"surround has shape {tuple(scan.surround.shape)}, air {tuple(scan.air.shape)}")
+        raise ValueError(
+            f"surround has shape {tuple(scan.surround.shape)}, air {tuple(scan.air.shape)}"
+        )
     check_exposure(scan.exposure_s)
-    low, high = (float(v) for v in torch.aminmax(scan.counts)) if scan.counts.numel() else (0.0, 0.0)
+    low, high = (
+        (float(v) for v in torch.aminmax(scan.counts)) if scan.counts.numel() else (0.0, 0.0)
+    )
     if not (np.isfinite(low) and np.isfinite(high)):  # aminmax propagates NaN
         bad = int((~torch.isfinite(scan.counts)).sum())
-        raise ValueError(f"{bad} readings are NaN or Inf: mask dead cells and interpolate them before")
+        raise ValueError(
+            f"{bad} readings are NaN or Inf: mask dead cells and interpolate them before"
+        )
     # Electronic noise and dark frames make readings of starved rays negative.
     noiseless = scan.quantum is not None and scan.electronic_noise == 0
     if low < 0 and (scan.counting or scan.noise_free or noiseless):
-        raise ValueError(f"counts must not be negative, the lowest is {low}: give raw counts, not line integrals")
+        raise ValueError(
+            f"counts must not be negative, the lowest is {low}: give raw counts, not line integrals"
+        )
     if high == 0:
-        raise ValueError("all counts are zero: the scan holds no signal (exposure too low, or beam blocked)")
+        raise ValueError(
+            "all counts are zero: the scan holds no signal (exposure too low, or beam blocked)"
+        )
     for name, readings in (("air", scan.air), ("surround", scan.surround)):
         if readings is not None and not bool(((readings > 0) & torch.isfinite(readings)).all()):
-            raise ValueError(f"{name} readings must be finite and greater than 0 in every cell: mask dead cells before")
+            raise ValueError(
+                f"{name} readings must be finite and greater than 0 in every cell: mask dead "
+                "cells before"
+            )
     choice("unit", scan.unit, UNITS)
     if scan.dead is not None and scan.dead.shape != scan.counts.shape:
-        raise ValueError(f"dead has shape {tuple(scan.dead.shape)}, counts {tuple(scan.counts.shape)}")
+        raise ValueError(
+            f"dead has shape {tuple(scan.dead.shape)}, counts {tuple(scan.counts.shape)}"
+        )
     if scan.flux is not None and tuple(scan.flux.shape) != (g.views,):
         raise ValueError(f"flux has shape {tuple(scan.flux.shape)}, expected ({g.views},)")
     _check_noise_model(scan)
@@ -500,9 +595,13 @@ def _check(scan: Scan) -> None:
 def _check_kinds(scan: Scan) -> None:
     for name, kind in (("geometry", Geometry), ("linearisation", WaterLinearisation)):
         if not isinstance(getattr(scan, name), kind):
-            raise TypeError(f"{name} must be a {kind.__name__}, got {type(getattr(scan, name)).__name__}")
+            raise TypeError(
+                f"{name} must be a {kind.__name__}, got {type(getattr(scan, name)).__name__}"
+            )
     if scan.window is not None and not isinstance(scan.window, DetectorWindow):
-        raise TypeError(f"window must be a DetectorWindow or None, got {type(scan.window).__name__}")
+        raise TypeError(
+            f"window must be a DetectorWindow or None, got {type(scan.window).__name__}"
+        )
     if scan.region is not None and not isinstance(scan.region, VolumeGrid):
         raise TypeError(f"region must be a VolumeGrid or None, got {type(scan.region).__name__}")
     for name in ("counts", "air", "surround", "quantum"):
@@ -511,7 +610,10 @@ def _check_kinds(scan: Scan) -> None:
             continue
         if not isinstance(values, Tensor) or not values.is_floating_point():
             found = values.dtype if isinstance(values, Tensor) else type(values).__name__
-            raise TypeError(f"{name} must be a floating point tensor, got {found}: use torch.as_tensor(…).float()")
+            raise TypeError(
+                f"{name} must be a floating point tensor, got {found}: use "
+                "torch.as_tensor(…).float()"
+            )
     if scan.seed is not None:
         whole("seed", scan.seed, low=0)
     if not isinstance(scan.info, Mapping):
@@ -523,8 +625,12 @@ def _check_noise_model(scan: Scan) -> None:
     if scan.quantum is None:
         return
     if scan.counting:
-        raise ValueError("quantum belongs to energy-integrating scans (counting=False): counts are Poisson")
+        raise ValueError(
+            "quantum belongs to energy-integrating scans (counting=False): counts are Poisson"
+        )
     if scan.quantum.shape != scan.counts.shape:
-        raise ValueError(f"quantum has shape {tuple(scan.quantum.shape)}, counts {tuple(scan.counts.shape)}")
+        raise ValueError(
+            f"quantum has shape {tuple(scan.quantum.shape)}, counts {tuple(scan.counts.shape)}"
+        )
     if not bool(((scan.quantum > 0) & torch.isfinite(scan.quantum)).all()):
         raise ValueError("quantum must be finite and greater than 0 keV in every reading")

@@ -14,13 +14,23 @@ from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, Volume
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["NoSlicesError", "read_geometry", "scan_fields", "slice_axis", "sliced", "write_geometry", "write_scan"]
+__all__ = [
+    "NoSlicesError",
+    "read_geometry",
+    "scan_fields",
+    "slice_axis",
+    "sliced",
+    "write_geometry",
+    "write_scan",
+]
 
 _VERSION = 5
-"""2: energy-integrating scans with their noise model. 3: with a checksum (:func:`torchpcct.files.write_hdf5`). 4:
-parallel and fan beams, flux, dead readings, units. 5: geometries given view by view; the region of a window, which
-earlier files lack and earlier readers leave aside."""
-# Compress in blocks of one view: fast to write, and a window of views, or of rows, can be read without the rest.
+"""2: energy-integrating scans with their noise model. 3: with a checksum
+(:func:`torchpcct.files.write_hdf5`). 4: parallel and fan beams, flux, dead readings, units. 5:
+geometries given view by view; the region of a window, which earlier files lack and earlier readers
+leave aside."""
+# Compress in blocks of one view: fast to write, and a window of views, or of rows, can be read
+# without the rest.
 _CHUNK_ROWS = 64
 _HDF5_COMPRESSION = {"compression": "lzf", "shuffle": True}
 
@@ -43,13 +53,19 @@ def write_scan(scan: Any, path: str | os.PathLike[str]) -> None:
         rows = min(rows, _CHUNK_ROWS) if scan.geometry.has_rows else rows
         chunk = (*(1,) * (scan.counts.ndim - 2), rows, columns)
         # Counts that are whole numbers compress as integers, and stay exact.
-        whole = scan.counting and not (scan.noise_free or scan.logged) and float(scan.counts.max()) < 2**31
+        whole = (
+            scan.counting
+            and not (scan.noise_free or scan.logged)
+            and float(scan.counts.max()) < 2**31
+        )
         whole = whole and bool((scan.counts == scan.counts.round()).all())
         data = scan.counts.to(torch.int32) if whole else scan.counts
         file.create_dataset("counts", data=data.numpy(), chunks=chunk, **_HDF5_COMPRESSION)
         file.create_dataset("air", data=scan.air.numpy())
         if scan.quantum is not None:
-            file.create_dataset("quantum_kev", data=scan.quantum.numpy(), chunks=chunk, **_HDF5_COMPRESSION)
+            file.create_dataset(
+                "quantum_kev", data=scan.quantum.numpy(), chunks=chunk, **_HDF5_COMPRESSION
+            )
         file.attrs["electronic_noise_kev"] = scan.electronic_noise
         if scan.flux is not None:
             file["flux"] = scan.flux.numpy()
@@ -61,24 +77,33 @@ def write_scan(scan: Any, path: str | os.PathLike[str]) -> None:
             window = file.create_group("window")
             window["first_column"] = scan.window.first_column
             window["surround"] = scan.surround.numpy()
-            window.attrs.update(columns=scan.window.columns, first_row=scan.window.first_row, rows=scan.window.rows)
+            window.attrs.update(
+                columns=scan.window.columns, first_row=scan.window.first_row, rows=scan.window.rows
+            )
             if scan.region is not None:
                 r = scan.region
-                window.attrs.update(region_shape=r.shape, region_spacing_mm=r.spacing, region_center_mm=r.center)
+                window.attrs.update(
+                    region_shape=r.shape, region_spacing_mm=r.spacing, region_center_mm=r.center
+                )
         # Written last: a file without it was cut off.
         file.attrs["complete"] = True
 
 
-def scan_fields(file: Any, path: str | os.PathLike[str], slices: slice | None = None) -> dict[str, Any]:
-    """Fields of the scan in an open HDF5 file; with ``slices`` those of some slices, or rows of a cone beam.
+def scan_fields(
+    file: Any, path: str | os.PathLike[str], slices: slice | None = None
+) -> dict[str, Any]:
+    """Fields of the scan in an open HDF5 file; with ``slices`` those of some slices, or rows of a
+    cone beam.
 
     Raises:
-        ValueError: a newer format, a file that was not written to its end, or slices of a scan that has none.
+        ValueError: a newer format, a file that was not written to its end, or slices of a scan that
+            has none.
         KeyError: something is missing.
     """
     if int(file.attrs["version"]) > _VERSION:
         raise ValueError(
-            f"{path} has format version {file.attrs['version']}, this software reads up to {_VERSION}: update torchpcct"
+            f"{path} has format version {file.attrs['version']}, this software reads up to "
+            f"{_VERSION}: update torchpcct"
         )
     if not file.attrs.get("complete", False):
         raise ValueError(f"{path} was not written to its end: simulate it again")
@@ -86,7 +111,10 @@ def scan_fields(file: Any, path: str | os.PathLike[str], slices: slice | None = 
     if "window" in file:
         w = file["window"]
         window = DetectorWindow(
-            w["first_column"][()], int(w.attrs["columns"]), int(w.attrs["first_row"]), int(w.attrs["rows"])
+            w["first_column"][()],
+            int(w.attrs["columns"]),
+            int(w.attrs["first_row"]),
+            int(w.attrs["rows"]),
         )
         surround = torch.from_numpy(w["surround"][()])
         if "region_shape" in w.attrs:
@@ -103,13 +131,16 @@ def scan_fields(file: Any, path: str | os.PathLike[str], slices: slice | None = 
             axis = slice_axis(geometry, shape, window)
             geometry, info["slices"] = sliced(geometry, slices, shape[axis])
         except ValueError as error:
-            raise type(error)(f"{path}: {error}") from error  # what was asked for is wrong, not the file
+            # what was asked for is wrong, not the file
+            raise type(error)(f"{path}: {error}") from error
         slices = slice(*info["slices"][:2])
 
     def given(name: str, axis: int = axis) -> Any:
         if name not in file:
             return None
-        return torch.from_numpy(file[name][()] if slices is None else file[name][(slice(None),) * axis + (slices,)])
+        return torch.from_numpy(
+            file[name][()] if slices is None else file[name][(slice(None),) * axis + (slices,)]
+        )
 
     return {
         "counts": given("counts").to(torch.float32),
@@ -138,17 +169,23 @@ def slice_axis(geometry: Geometry, shape: tuple[int, ...], window: Any = None) -
     Raises:
         NoSlicesError: there is none.
     """
-    if len(shape) != 3 or window is not None or (geometry.has_rows and not isinstance(geometry, ConeBeam)):
+    if (
+        len(shape) != 3
+        or window is not None
+        or (geometry.has_rows and not isinstance(geometry, ConeBeam))
+    ):
         kind = "part of a detector (a region)" if window is not None else type(geometry).__name__
         raise NoSlicesError(
-            f"slices= picks slices of parallel and fan beams or rows of a cone beam, this is one {kind} of "
+            "slices= picks slices of parallel and fan beams or rows of a cone beam, this is one "
+            f"{kind} of "
             f"{len(shape)} axes"
         )
     return 1 if geometry.has_rows else 0
 
 
 def sliced(geometry: Any, slices: slice, count: int) -> tuple[Any, list[int]]:
-    """Geometry of some of ``count`` slices or rows, and what a scan's ``info["slices"]`` says: first, stop, count."""
+    """Geometry of some of ``count`` slices or rows, and what a scan's ``info["slices"]`` says:
+    first, stop, count."""
     first, stop, step = slices.indices(count)
     if step != 1 or stop <= first:
         ends = ":".join("" if end is None else str(end) for end in (slices.start, slices.stop))
@@ -186,7 +223,10 @@ def read_geometry(group: Any) -> Geometry:
     kind, columns = str(a.get("kind", "ConeBeam")), int(a["columns"])
     if kind == "VectorGeometry":
         return VectorGeometry(
-            group["vectors_mm"][()], columns, int(a["rows"]) if "rows" in a else None, bool(a["parallel"])
+            group["vectors_mm"][()],
+            columns,
+            int(a["rows"]) if "rows" in a else None,
+            bool(a["parallel"]),
         )
     angles = group["angles_rad"][()]
     if kind == "ParallelBeam":

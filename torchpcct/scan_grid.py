@@ -22,7 +22,8 @@ Floats = NDArray[np.float64]
 _SLACK = 1e-6
 """Of a voxel: an extent that is a whole number of voxels stays one."""
 _LEAST_MARGIN = 1
-"""Columns beside a grid's footprint that reconstruction needs; a scan that was acquired for a region has more."""
+"""Columns beside a grid's footprint that reconstruction needs; a scan that was acquired for a
+region has more."""
 _SHARES = 40
 """Sizes that are tried, the largest first."""
 
@@ -52,7 +53,9 @@ def grid_of(scan: Any, voxel: Any = None, extent: Any = None, center: Any = None
     else:
         height = size[0] or g.rows * g.pitch[0] / g.magnification * (1.0 - radius / g.sod)
         middle = center[0] or 0.0
-    return VolumeGrid((max(1, math.floor(height / voxel + _SLACK)), *plane), voxel, (middle, *center[1:]))
+    return VolumeGrid(
+        (max(1, math.floor(height / voxel + _SLACK)), *plane), voxel, (middle, *center[1:])
+    )
 
 
 def _voxels(extent: Any, voxel: Any) -> tuple[int, ...]:
@@ -72,13 +75,20 @@ def _of_axes(scan: Any, extent: Any, center: Any) -> tuple[list[float] | None, l
     extent = None if extent is None else list(numbers("extent", extent, positive=True, unit="mm"))
     center = None if center is None else list(numbers("center", center, unit="mm"))
     if extent is not None and len(extent) != (2 if flat else 3):
-        wanted = "two numbers, Y X: this scan's slices are those of its readings" if flat else "three numbers, Z Y X"
+        wanted = (
+            "two numbers, Y X: this scan's slices are those of its readings"
+            if flat
+            else "three numbers, Z Y X"
+        )
         raise ValueError(f"extent must be {wanted}; got {len(extent)}")
     if center is not None and len(center) not in ((2,) if single else (2, 3) if flat else (3,)):
         raise ValueError(
-            f"center must be {'two numbers, Y X' if single else 'three numbers, Z Y X'}; got {len(center)}"
+            f"center must be {'two numbers, Y X' if single else 'three numbers, Z Y X'}; got "
+            f"{len(center)}"
         )
-    return extent and [0.0] * (3 - len(extent)) + extent, center and [None] * (3 - len(center)) + center
+    return extent and [0.0] * (3 - len(extent)) + extent, center and [None] * (
+        3 - len(center)
+    ) + center
 
 
 def _field_of_view(g: Any) -> tuple[float, float]:
@@ -104,7 +114,8 @@ def _cell(g: Any) -> float:
 
 
 def cells_at_axis(geometry: Any) -> tuple[float, float, float]:
-    """Size of a detector cell as it is seen at the axis, along z, y and x in mm; along z inf without rows.
+    """Size of a detector cell as it is seen at the axis, along z, y and x in mm; along z inf
+    without rows.
 
     Of a geometry view by view the median over its views.
     """
@@ -122,11 +133,12 @@ def finite_cells(geometry: Any) -> list[float]:
     return [cell for cell in cells_at_axis(geometry) if math.isfinite(cell)]
 
 
-# --- a part of the detector -----------------------------------------------------------------------------------------
+# --- a part of the detector -----------------------------------------------------------------------
 
 
 def _of_region(scan: Any, voxel: float | None, extent: Any, center: Any) -> VolumeGrid:
-    """The region; with another voxel size or extent, or from one voxel (an extent alone), a grid about it."""
+    """The region; with another voxel size or extent, or from one voxel (an extent alone), a grid
+    about it."""
     region = scan.region
     if region is None:
         voxel = voxel or _cell(scan.geometry)
@@ -136,11 +148,14 @@ def _of_region(scan: Any, voxel: float | None, extent: Any, center: Any) -> Volu
     if voxel is None and extent is None and center is None:
         return region
     spacing = voxel or region.spacing
-    return VolumeGrid(_voxels(extent or region.extent, spacing), spacing, tuple(center or region.center))
+    return VolumeGrid(
+        _voxels(extent or region.extent, spacing), spacing, tuple(center or region.center)
+    )
 
 
 def _seen_by(g: ConeBeam, window: DetectorWindow, voxel: float) -> VolumeGrid:
-    """A box that all views of a window see: of a file that does not say for which region it was acquired.
+    """A box that all views of a window see: of a file that does not say for which region it was
+    acquired.
 
     Raises:
         ValueError: there is no such box.
@@ -148,15 +163,18 @@ def _seen_by(g: ConeBeam, window: DetectorWindow, voxel: float) -> VolumeGrid:
     for margin in (NOISE_MARGIN_COLUMNS, _LEAST_MARGIN):
         if (box := _box(g, window, voxel, margin)) is not None:
             return box
-    raise ValueError("no box is seen by all views of this scan's part of the detector: give extent and center")
+    raise ValueError(
+        "no box is seen by all views of this scan's part of the detector: give extent and center"
+    )
 
 
 def _box(g: ConeBeam, window: DetectorWindow, voxel: float, margin: int) -> VolumeGrid | None:
-    """The box with the longest edges, whole voxels of them, whose footprint, ``margin`` columns wider, a window holds.
+    """The box with the longest edges, whole voxels of them, whose footprint, ``margin`` columns
+    wider, a window holds.
 
-    The lines at the window's edges are half-planes that the box must not leave. A box of centre c and half edges h lies
-    in n · p ≥ d if n · c − |n| · h ≥ d, so the one with the longest edges is a linear programme (Boyd and Vandenberghe,
-    Convex Optimization, 2004, section 4.3).
+    The lines at the window's edges are half-planes that the box must not leave. A box of centre c
+    and half edges h lies in n · p ≥ d if n · c − |n| · h ≥ d, so the one with the longest edges is
+    a linear programme (Boyd and Vandenberghe, Convex Optimization, 2004, section 4.3).
     """
     if window.columns <= 2 * margin:
         return None
@@ -190,7 +208,8 @@ def _box(g: ConeBeam, window: DetectorWindow, voxel: float, margin: int) -> Volu
         bottom = top = float(rows.mean()) / g.magnification
     height = max(top - bottom, 0.5 * g.pitch[0] / g.magnification)
 
-    # A window is as wide in every view as in the widest, and begins where the region does: the whole box may be beyond.
+    # A window is as wide in every view as in the widest, and begins where the region does: the
+    # whole box may be beyond.
     for share in np.linspace(1.0, 0.0, _SHARES, endpoint=False):
         shape = [max(1, math.floor(share * e / voxel + _SLACK)) for e in (height, *(2.0 * half))]
         box = VolumeGrid(shape, voxel, (0.5 * (bottom + top), *place))

@@ -1,9 +1,11 @@
-"""What a program may switch for all of torch and numpy, set to what this package's numbers are made for.
+"""What a program may switch for all of torch and numpy, set to what this package's numbers are made
+for.
 
-A user's own code may have set another default dtype or device, work under autocast, or have numpy raise floating-point
-errors. None of that shall change a result. :func:`unswitched` puts the switches back for the length of a call;
-:func:`torchpcct.validate.checked` does so for every function that it makes, so that what such a function calls need
-not name dtype and device in every line.
+A user's own code may have set another default dtype or device, work under autocast, or have numpy
+raise floating-point errors. None of that shall change a result. :func:`unswitched` puts the
+switches back for the length of a call; :func:`torchpcct.validate.checked` does so for every
+function that it makes, so that what such a function calls need not name dtype and device in every
+line.
 """
 
 from __future__ import annotations
@@ -26,10 +28,11 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def unswitched() -> AbstractContextManager[Any]:
-    """Within: numpy's errors as numpy has them, float32 and the CPU as torch's defaults, no autocast.
+    """Within: numpy's errors as numpy has them, float32 and the CPU as torch's defaults, no
+    autocast.
 
-    Where nothing is switched, which costs a microsecond to find out, nothing is done. The default dtype is that of all
-    threads of the process while the call runs.
+    Where nothing is switched, which costs a microsecond to find out, nothing is done. The default
+    dtype is that of all threads of the process while the call runs.
     """
     torch: Any = sys.modules.get("torch")  # what does not need it does not load it
     numpy_as_ever = np.geterr() == _ERRORS

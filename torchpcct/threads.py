@@ -1,7 +1,9 @@
-"""Kernels on several threads: a compiled loop over ``begin … end`` is dealt out in pieces, to the caller too.
+"""Kernels on several threads: a compiled loop over ``begin … end`` is dealt out in pieces, to the
+caller too.
 
-numba's own loops (``prange``) take a quarter longer to compile, and run on OpenMP, whose threads do not outlive a fork
-and fight with those of torch. These here are plain threads that wait asleep; a forked process starts its own.
+numba's own loops (``prange``) take a quarter longer to compile, and run on OpenMP, whose threads do
+not outlive a fork and fight with those of torch. These here are plain threads that wait asleep; a
+forked process starts its own.
 """
 
 from __future__ import annotations
@@ -23,8 +25,8 @@ _helpers: ThreadPoolExecutor | None = None
 
 
 def get_num_threads() -> int:
-    """Threads of a call: those of :func:`set_num_threads`, else of the environment's ``NUMBA_NUM_THREADS``, else all
-    that the processor has."""
+    """Threads of a call: those of :func:`set_num_threads`, else of the environment's
+    ``NUMBA_NUM_THREADS``, else all that the processor has."""
     global _number
     if _number is None:
         from numba import config  # late: importing the package stays quick
@@ -43,7 +45,8 @@ def set_num_threads(number: int) -> None:
 
 
 def _renew() -> None:
-    """Helpers are started anew: of another number, or in a forked process, where the threads stayed behind."""
+    """Helpers are started anew: of another number, or in a forked process, where the threads
+    stayed behind."""
     global _helpers
     _helpers = None
 
@@ -59,7 +62,8 @@ def _helped(work: Any, number: int) -> list[Future[None]]:
         _helpers = ThreadPoolExecutor(max(get_num_threads() - 1, 1), "torchpcct")
     try:
         return [_helpers.submit(work) for _ in range(number)]
-    except RuntimeError:  # the system, or an interpreter that is ending, has no more threads: the caller does it all
+    # the system, or an interpreter that is ending, has no more threads: the caller does it all
+    except RuntimeError:
         return []
 
 
@@ -67,10 +71,11 @@ def run(kernel: Any, count: int, *args: Any, operations: int = _LEAST) -> None:
     """``kernel(begin, end, *args)`` on pieces of 0 … count, at once on several threads.
 
     Args:
-        kernel: compiled with ``nogil=True``; whatever it writes at an index must be that index's alone, so that the
-            result does not depend on the pieces.
+        kernel: compiled with ``nogil=True``; whatever it writes at an index must be that index's
+            alone, so that the result does not depend on the pieces.
         count: number of indices.
-        operations: about how many sums and products an index takes; too little work for two stays on this thread.
+        operations: about how many sums and products an index takes; too little work for two stays
+            on this thread.
 
     Raises:
         Exception: what a kernel raises, once no other thread computes any more.

@@ -1,4 +1,5 @@
-"""Checks of what a caller hands in: each returns the clean value, or raises an error that names value and remedy."""
+"""Checks of what a caller hands in: each returns the clean value, or raises an error that names
+value and remedy."""
 
 from __future__ import annotations
 
@@ -29,16 +30,20 @@ __all__ = [
     "renamed",
     "shaped",
     "whole",
-]  # fmt: skip
+]
 
 UNITS = ("HU", "mm^-1", "pixel^-1")
 """Of scans and volumes; of ``pixel^-1`` all lengths are in pixels."""
 
 
 def renamed(old: str, new: str, value: Any) -> Any:
-    """``value``, which came as the argument ``old`` that is now called ``new``: with a ``DeprecationWarning``."""
+    """``value``, which came as the argument ``old`` that is now called ``new``: with a
+    ``DeprecationWarning``."""
     level, frame = 2, inspect.currentframe()
-    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in ("torchpcct", "recon"):
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in (
+        "torchpcct",
+        "recon",
+    ):
         level, frame = level + 1, frame.f_back
     warnings.warn(f"{old} is now called {new}", DeprecationWarning, stacklevel=max(2, level - 2))
     return value
@@ -75,7 +80,8 @@ def number(
         result = float(value)
     except (TypeError, ValueError):
         raise TypeError(
-            f"{name} must be a number{unit and ' in' + unit}, got {value!r} ({type(value).__name__})"
+            f"{name} must be a number{unit and ' in' + unit}, got {value!r} "
+            f"({type(value).__name__})"
         ) from None
     if math.isnan(result) or (finite and math.isinf(result)):
         raise ValueError(f"{name} must be {'finite' if finite else 'a number'}, got {value!r}")
@@ -132,13 +138,16 @@ def per_axis(name: str, value: Any, axes: int, **limits: Any) -> tuple[float, ..
     """
     if isinstance(value, Sequence | np.ndarray) and not isinstance(value, str):
         if len(value) != axes:
-            raise ValueError(f"{name} must be one number or {axes} numbers (one per axis), got {value!r}")
+            raise ValueError(
+                f"{name} must be one number or {axes} numbers (one per axis), got {value!r}"
+            )
         return numbers(name, value, axes, **limits)
     return (number(name, value, **limits),) * axes
 
 
 def whole(name: str, value: Any, low: int = 1, high: int | None = None) -> int:
-    """``value`` as an int of at least ``low`` and, if given, at most ``high``; ``True`` and ``3.0`` are refused.
+    """``value`` as an int of at least ``low`` and, if given, at most ``high``; ``True`` and ``3.0``
+    are refused.
 
     Raises:
         TypeError: no whole number.
@@ -153,11 +162,16 @@ def whole(name: str, value: Any, low: int = 1, high: int | None = None) -> int:
     return int(value)
 
 
-_UNITS = {"": 1, "B": 1, **{f"{p}{b}": k**n for n, p in enumerate("KMGT", 1) for b, k in (("B", 1000), ("IB", 1024))}}
+_UNITS = {
+    "": 1,
+    "B": 1,
+    **{f"{p}{b}": k**n for n, p in enumerate("KMGT", 1) for b, k in (("B", 1000), ("IB", 1024))},
+}
 
 
 def memory_bytes(value: int | str) -> int:
-    """A limit of memory in bytes: a whole number, or a text such as ``4GB`` (10⁹) or ``4 GiB`` (2³⁰).
+    """A limit of memory in bytes: a whole number, or a text such as ``4GB`` (10⁹) or ``4 GiB``
+    (2³⁰).
 
     Raises:
         ValueError: no such text, or 0. TypeError: neither text nor whole number.
@@ -182,7 +196,9 @@ def choice(name: str, value: Any, options: Collection[str]) -> str:
         ValueError: it is not; the message lists them.
     """
     if not isinstance(value, str) or value not in options:
-        raise ValueError(f"unknown {name} {value!r}: use one of {', '.join(options)}{meant(value, options)}")
+        raise ValueError(
+            f"unknown {name} {value!r}: use one of {', '.join(options)}{meant(value, options)}"
+        )
     return str(value)
 
 
@@ -219,7 +235,8 @@ def broadcast(**arrays: Any) -> list[Any]:
 
 
 def shaped(name: str, value: Any, wanted: tuple[int | None, ...]) -> None:
-    """Refuse an array or tensor of another shape, before a compiled kernel that checks no index reads it.
+    """Refuse an array or tensor of another shape, before a compiled kernel that checks no index
+    reads it.
 
     Args:
         name: what the message calls it.
@@ -230,17 +247,29 @@ def shaped(name: str, value: Any, wanted: tuple[int | None, ...]) -> None:
         ValueError: another number of axes, another length.
     """
     found = tuple(np.shape(value) if not hasattr(value, "shape") else value.shape)
-    if len(found) != len(wanted) or any(w not in (None, n) for n, w in zip(found, wanted, strict=True)):
+    if len(found) != len(wanted) or any(
+        w not in (None, n) for n, w in zip(found, wanted, strict=True)
+    ):
         text = ", ".join("any" if n is None else str(n) for n in wanted)
-        raise ValueError(f"{name} must have the shape ({text}{',' * (len(wanted) == 1)}), got {found}")
+        raise ValueError(
+            f"{name} must have the shape ({text}{',' * (len(wanted) == 1)}), got {found}"
+        )
 
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 _KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "int": ("a whole number", lambda v: isinstance(v, int | np.integer) and not _is_truth(v)),
-    "float": ("a number", lambda v: not _is_truth(v) and (
-        isinstance(v, int | np.integer | float | np.floating) or (getattr(v, "shape", None) == () and _is_real(v)))),
+    "float": (
+        "a number",
+        lambda v: (
+            not _is_truth(v)
+            and (
+                isinstance(v, int | np.integer | float | np.floating)
+                or (getattr(v, "shape", None) == () and _is_real(v))
+            )
+        ),
+    ),
     "str": ("a text", lambda v: isinstance(v, str)),
     "bool": ("True or False", lambda v: _is_truth(v)),
     "None": ("None", lambda v: v is None),
@@ -249,8 +278,11 @@ _KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "Floats": ("real numbers", lambda v: _is_real(v)),
     "Callable": ("a function", callable),
     "Mapping": ("a mapping", lambda v: isinstance(v, Mapping)),
-    "Sequence": ("a sequence", lambda v: isinstance(v, Iterable) and not isinstance(v, str | bytes | Mapping)),
-}  # fmt: skip
+    "Sequence": (
+        "a sequence",
+        lambda v: isinstance(v, Iterable) and not isinstance(v, str | bytes | Mapping),
+    ),
+}
 """Name of an annotation, in words, and whether a value is one."""
 _SAID = {
     "Tensor": "a torch.Tensor",
@@ -260,20 +292,25 @@ _SAID = {
 
 
 def checked(function: F) -> F:
-    """A function that refuses arguments which its annotations exclude, by name, before it does anything.
+    """A function that refuses arguments which its annotations exclude, by name, before it does
+    anything.
 
-    Checked are ``int``, ``float``, ``str``, ``bool``, ``Tensor``, ``ArrayLike`` (real numbers of any shape),
-    ``Callable``, ``Sequence``, ``Mapping``, ``tuple[float, ...]`` (of a fixed length, too), classes, and what ``|``
-    joins; every other annotation lets everything pass. Values are handed on as they are: shapes and ranges are the
-    function's own business. It runs :func:`torchpcct.switches.unswitched`: what a program has switched in torch and
-    numpy does not change its result.
+    Checked are ``int``, ``float``, ``str``, ``bool``, ``Tensor``, ``ArrayLike`` (real numbers of
+    any shape), ``Callable``, ``Sequence``, ``Mapping``, ``tuple[float, ...]`` (of a fixed length,
+    too), classes, and what ``|`` joins; every other annotation lets everything pass. Values are
+    handed on as they are: shapes and ranges are the function's own business. It runs
+    :func:`torchpcct.switches.unswitched`: what a program has switched in torch and numpy does not
+    change its result.
 
     Raises:
         TypeError: of the function that is made, for such an argument.
     """
     signature = inspect.signature(function)
-    annotations = {name: str(p.annotation) for name, p in signature.parameters.items()
-            if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}  # fmt: skip
+    annotations = {
+        name: str(p.annotation)
+        for name, p in signature.parameters.items()
+        if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)
+    }
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -286,7 +323,11 @@ def checked(function: F) -> F:
                 continue
             kinds = _alternatives(annotations[name])
             if not any(_is(value, kind, function.__globals__) for kind in kinds):
-                remedy = ": torch.from_numpy makes one" if "Tensor" in kinds and isinstance(value, np.ndarray) else ""
+                remedy = (
+                    ": torch.from_numpy makes one"
+                    if "Tensor" in kinds and isinstance(value, np.ndarray)
+                    else ""
+                )
                 wanted = " or ".join(dict.fromkeys(_in_words(kind) for kind in kinds))
                 raise TypeError(f"{name} must be {wanted}, got {_short(value)}{remedy}")
         with unswitched():
@@ -328,7 +369,9 @@ def _is(value: Any, kind: str, names: Mapping[str, Any]) -> bool:
         parts = inner.rstrip("]").split(", ")
         if "..." not in parts and len(parts) != len(value):
             return False
-        return set(parts) - {"..."} not in ({"float"}, {"int"}) or all(_is(v, parts[0], names) for v in value)
+        return set(parts) - {"..."} not in ({"float"}, {"int"}) or all(
+            _is(v, parts[0], names) for v in value
+        )
     known = names.get(head)
     if isinstance(known, type):
         return isinstance(value, known)
@@ -345,6 +388,8 @@ def _is_real(value: Any) -> bool:
     if value is None or isinstance(value, str | bytes | Mapping):
         return False
     try:
-        return np.asarray(value.detach() if hasattr(value, "detach") else value).dtype.kind in "fiub"
+        return (
+            np.asarray(value.detach() if hasattr(value, "detach") else value).dtype.kind in "fiub"
+        )
     except (TypeError, ValueError, RuntimeError):
         return False

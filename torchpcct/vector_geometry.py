@@ -1,9 +1,10 @@
 """Per-view geometry: every view has its own source and its own flat detector, wherever they stand.
 
-One concept for detectors that tilt, roll and jitter, sources that wobble, axes counted the other way, helices, tilted
-parallel rays (laminography), and what ASTRA's ``parallel_vec``, ``fanflat_vec``, ``parallel3d_vec`` and ``cone_vec`` or
-RTK's XML say. A view is four vectors in mm: the source (of parallel rays: their direction), the detector's centre,
-``u``, the step to the next column, and ``v``, the step to the next row. Cell ``(i, j)`` of ``rows × columns`` stands at
+One concept for detectors that tilt, roll and jitter, sources that wobble, axes counted the other
+way, helices, tilted parallel rays (laminography), and what ASTRA's ``parallel_vec``,
+``fanflat_vec``, ``parallel3d_vec`` and ``cone_vec`` or RTK's XML say. A view is four vectors in mm:
+the source (of parallel rays: their direction), the detector's centre, ``u``, the step to the next
+column, and ``v``, the step to the next row. Cell ``(i, j)`` of ``rows × columns`` stands at
 ``centre + (j − (columns − 1) / 2) u + (i − (rows − 1) / 2) v``.
 """
 
@@ -29,15 +30,15 @@ class VectorGeometry(Geometry):
     """A scan that is given view by view.
 
     Args:
-        vectors: ``(views, 6)`` without rows: source x, y, centre x, y, u x, y; ``(views, 12)`` with rows: source
-            x, y, z, centre, u, v; mm. ASTRA's, whose order and directions these are.
+        vectors: ``(views, 6)`` without rows: source x, y, centre x, y, u x, y; ``(views, 12)`` with
+            rows: source x, y, z, centre, u, v; mm. ASTRA's, whose order and directions these are.
         columns: detector columns.
         rows: detector rows, None without.
         parallel: parallel rays; then the first entries are the rays' direction, of any length.
 
     Raises:
-        ValueError: a wrong shape, values that are not finite, rays of no direction, a detector without area or that
-            its rays meet edge on.
+        ValueError: a wrong shape, values that are not finite, rays of no direction, a detector
+            without area or that its rays meet edge on.
         TypeError: a value of the wrong kind.
     """
 
@@ -54,7 +55,8 @@ class VectorGeometry(Geometry):
             raise ValueError(f"vectors must have shape (views, 6) or (views, 12), got {v.shape}")
         if v.shape[1] != width:
             raise ValueError(
-                f"{v.shape[1]} numbers per view need rows {'= None' if v.shape[1] == 6 else '≥ 1'}, got {self.rows!r}"
+                f"{v.shape[1]} numbers per view need rows "
+                f"{'= None' if v.shape[1] == 6 else '≥ 1'}, got {self.rows!r}"
             )
         if not np.isfinite(v).all():
             view = int(np.argmin(np.isfinite(v).all(1)))
@@ -73,13 +75,15 @@ class VectorGeometry(Geometry):
         bad = volume <= 1e-9 * sizes[0] * sizes[1] * sizes[2]
         if bad.any():
             raise ValueError(
-                f"the rays of view {int(bad.argmax())} do not meet their detector, or meet it edge on: are its vectors "
+                f"the rays of view {int(bad.argmax())} do not meet their detector, or meet it "
+                "edge on: are its vectors "
                 "in the order source, centre, u, v?"
             )
 
     @property
     def poses(self) -> Floats:
-        """``(views, 4, 3)`` source (or direction), centre, u, v; without rows in the plane z = 0, v along z, 1 mm."""
+        """``(views, 4, 3)`` source (or direction), centre, u, v; without rows in the plane z =
+        0, v along z, 1 mm."""
         if self.rows is not None:
             return np.asarray(self.vectors).reshape(-1, 4, 3)
         out = np.zeros((len(self.vectors), 4, 3))
@@ -99,7 +103,11 @@ class VectorGeometry(Geometry):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        return (self.views, self.columns) if self.rows is None else (self.views, self.rows, self.columns)
+        return (
+            (self.views, self.columns)
+            if self.rows is None
+            else (self.views, self.rows, self.columns)
+        )
 
     @classmethod
     @checked
@@ -108,30 +116,47 @@ class VectorGeometry(Geometry):
 
         Args:
             geometry: parallel, fan or cone beam.
-            motion: displacement of the grid in every view as for ``Projector``, or None: source and detector move the
-                other way, so that the volume may stand still.
+            motion: displacement of the grid in every view as for ``Projector``, or None: source and
+                detector move the other way, so that the volume may stand still.
 
         Raises:
-            ValueError: a curved detector, which flat ones cannot describe; a motion of the wrong shape.
+            ValueError: a curved detector, which flat ones cannot describe; a motion of the wrong
+                shape.
             TypeError: another geometry.
         """
         if not isinstance(geometry, ParallelBeam | FanBeam | ConeBeam):
-            raise TypeError(f"geometry must be ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}")
-        rows, parallel = geometry.rows if isinstance(geometry, ConeBeam) else None, isinstance(geometry, ParallelBeam)
+            raise TypeError(
+                f"geometry must be ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}"
+            )
+        rows, parallel = (
+            geometry.rows if isinstance(geometry, ConeBeam) else None,
+            isinstance(geometry, ParallelBeam),
+        )
         radial = np.stack([np.cos(geometry.angles), np.sin(geometry.angles)], axis=1)
         tangent = np.stack([-radial[:, 1], radial[:, 0]], axis=1)
         if isinstance(geometry, ParallelBeam):
             parts = [-radial, geometry.offset * tangent, geometry.pitch * tangent]
         else:
             if geometry.detector == "curved":
-                raise ValueError("vectors describe flat detectors only, this one is curved: use detector='flat'")
+                raise ValueError(
+                    "vectors describe flat detectors only, this one is curved: use detector='flat'"
+                )
             source, foot = geometry.sod * radial, (geometry.sod - geometry.sdd) * radial
             if isinstance(geometry, FanBeam):
                 parts = [source, foot + geometry.offset * tangent, geometry.pitch * tangent]
             else:
                 zero = np.zeros((geometry.views, 1))
-                parts = [source, zero, foot + geometry.offset[1] * tangent, zero + geometry.offset[0],
-                         geometry.pitch[1] * tangent, zero, zero, zero, zero + geometry.pitch[0]]  # fmt: skip
+                parts = [
+                    source,
+                    zero,
+                    foot + geometry.offset[1] * tangent,
+                    zero + geometry.offset[0],
+                    geometry.pitch[1] * tangent,
+                    zero,
+                    zero,
+                    zero,
+                    zero + geometry.pitch[0],
+                ]
         made = cls(np.concatenate(parts, axis=1), geometry.columns, rows, parallel)
         return made if motion is None else made.moved(motion)
 
@@ -139,8 +164,9 @@ class VectorGeometry(Geometry):
         """The rays through the outer edge of the detector, each ``(views, rays)``.
 
         Returns:
-            Distance from the z axis at their closest approach in mm, their height z there in mm, and how much they
-            climb per mm on the way across the axis. Of a detector without rows the heights and climbs are 0.
+            Distance from the z axis at their closest approach in mm, their height z there in mm,
+            and how much they climb per mm on the way across the axis. Of a detector without rows
+            the heights and climbs are 0.
 
         Raises:
             ValueError: rays along z, which have no closest approach.
@@ -153,10 +179,17 @@ class VectorGeometry(Geometry):
         ]
         at, (first, centre, u, v) = np.array(edge), self.poses.transpose(1, 0, 2)
         point = centre[:, None] + at[:, :1] * u[:, None] + at[:, 1:] * v[:, None]
-        ray = np.broadcast_to(first[:, None], point.shape) if self.parallel else point - first[:, None]
+        ray = (
+            np.broadcast_to(first[:, None], point.shape)
+            if self.parallel
+            else point - first[:, None]
+        )
         flat = np.linalg.norm(ray[..., :2], axis=-1, keepdims=True)
         if (flat <= 1e-6 * np.linalg.norm(ray, axis=-1, keepdims=True)).any():
-            raise ValueError(f"rays of view {int(flat.min(1).argmin())} run along z: turn the scan so that they do not")
+            raise ValueError(
+                f"rays of view {int(flat.min(1).argmin())} run along z: turn the scan so that "
+                "they do not"
+            )
         ray = ray / flat
         to_axis = -(point[..., :2] * ray[..., :2]).sum(-1, keepdims=True)
         nearest = point + to_axis * ray
@@ -175,15 +208,19 @@ class VectorGeometry(Geometry):
         return float(np.median(width))
 
     def select(self, views: Any) -> VectorGeometry:
-        """The same scan with a subset (or reordering) of the views: an index array, mask or slice."""
+        """The same scan with a subset (or reordering) of the views: an index array, mask or
+        slice."""
         return replace(self, vectors=self.vectors[views])
 
     def flipped(self, *, columns: bool = False, rows: bool = False) -> VectorGeometry:
         """The same detector with columns or rows counted the other way."""
-        return self._with(2, -self.poses[:, 2] if columns else None, 3, -self.poses[:, 3] if rows else None)
+        return self._with(
+            2, -self.poses[:, 2] if columns else None, 3, -self.poses[:, 3] if rows else None
+        )
 
     def shifted(self, columns: Any = 0.0, rows: Any = 0.0) -> VectorGeometry:
-        """The detector displaced in its own plane, by parts of a cell: ``centre + columns · u + rows · v``.
+        """The detector displaced in its own plane, by parts of a cell: ``centre + columns · u +
+        rows · v``.
 
         Args:
             columns, rows: numbers, or ``(views,)``: jitter.
@@ -204,8 +241,13 @@ class VectorGeometry(Geometry):
             ValueError: roll or tilt of a detector without rows.
         """
         if self.rows is None and (np.any(roll) or np.any(tilt)):
-            raise ValueError("a detector without rows can only be slanted: roll and tilt would leave the plane")
-        roll, tilt, slant = (_per_view(n, x, self.views) for n, x in (("roll", roll), ("tilt", tilt), ("slant", slant)))
+            raise ValueError(
+                "a detector without rows can only be slanted: roll and tilt would leave the plane"
+            )
+        roll, tilt, slant = (
+            _per_view(n, x, self.views)
+            for n, x in (("roll", roll), ("tilt", tilt), ("slant", slant))
+        )
         u, v = self.poses[:, 2], self.poses[:, 3]
         u = _rotated(u, v, slant)
         v = _rotated(v, u, tilt)
@@ -225,9 +267,11 @@ class VectorGeometry(Geometry):
         return self._with(1, poses[:, 1] - back, 0, None if self.parallel else poses[:, 0] - back)
 
     def as_circular(self) -> tuple[Geometry, Floats | None] | None:
-        """The circular scan, and the motion of the grid or None, that this scan is, to 1e-9; else None.
+        """The circular scan, and the motion of the grid or None, that this scan is, to 1e-9; else
+        None.
 
-        A radial displacement and a larger orbit look the same: the orbit is the one with the smallest motion.
+        A radial displacement and a larger orbit look the same: the orbit is the one with the
+        smallest motion.
         """
         if self.parallel and self.rows is not None:
             return None  # no parallel beam with rows is one of ours
@@ -235,14 +279,24 @@ class VectorGeometry(Geometry):
         angles = np.arctan2(-u[:, 0], u[:, 1])  # columns grow along (-sin, cos)
         radial, tangent = (np.stack(x, axis=1) for x in ((u[:, 1], -u[:, 0]), (u[:, 0], u[:, 1])))
         pitch = np.linalg.norm(tangent, axis=1)
-        radial, tangent, pitch = radial / pitch[:, None], tangent / pitch[:, None], float(pitch.mean())
+        radial, tangent, pitch = (
+            radial / pitch[:, None],
+            tangent / pitch[:, None],
+            float(pitch.mean()),
+        )
         found: Geometry
         if self.parallel:
             offset = float((centre[:, :2] * tangent).sum(1).mean())
-            found, motion = ParallelBeam(angles, self.columns, pitch, offset), offset * tangent - centre[:, :2]
+            found, motion = (
+                ParallelBeam(angles, self.columns, pitch, offset),
+                offset * tangent - centre[:, :2],
+            )
         else:
             way = source - centre
-            sdd, offset = float((way[:, :2] * radial).sum(1).mean()), -float((way[:, :2] * tangent).sum(1).mean())
+            sdd, offset = (
+                float((way[:, :2] * radial).sum(1).mean()),
+                -float((way[:, :2] * tangent).sum(1).mean()),
+            )
             sod, row_pitch = float((source[:, :2] * radial).sum(1).mean()), float(up[:, 2].mean())
             if not (0 < sod < sdd and row_pitch > 0):
                 return None
@@ -257,7 +311,9 @@ class VectorGeometry(Geometry):
         again, far = self.of(found, motion).vectors, float(np.abs(v).max())
         scale = np.full(v.shape[1], far)
         if self.parallel:  # a ray's direction has no length, and its line no sense
-            v[:, :2] *= (np.sign((v[:, :2] * again[:, :2]).sum(1)) / np.linalg.norm(v[:, :2], axis=1))[:, None]
+            v[:, :2] *= (
+                np.sign((v[:, :2] * again[:, :2]).sum(1)) / np.linalg.norm(v[:, :2], axis=1)
+            )[:, None]
             axes = 2 if self.rows is None else 3
             far = float(np.abs(v[:, axes:]).max())
             scale[:axes], scale[axes:] = 1.0, far
@@ -284,7 +340,10 @@ def check_motion(motion: Any, views: int, axes: int) -> Floats:
     """
     shift = np.array(motion, dtype=np.float64)
     if shift.shape != (views, axes):
-        raise ValueError(f"motion needs the shape ({views}, {axes}): views and the grid's axes, got {shift.shape}")
+        raise ValueError(
+            f"motion needs the shape ({views}, {axes}): views and the grid's axes, got "
+            f"{shift.shape}"
+        )
     if not np.isfinite(shift).all():
         raise ValueError("motion has values that are not finite")
     return shift
@@ -292,9 +351,11 @@ def check_motion(motion: Any, views: int, axes: int) -> Floats:
 
 @checked
 def helical_motion(geometry: ConeBeam, feed: float, start: float = 0.0) -> Floats:
-    """The table's travel as a displacement of the grid, ``(views, 3)`` z, y, x mm, for ``Projector(…, motion=…)``.
+    """The table's travel as a displacement of the grid, ``(views, 3)`` z, y, x mm, for
+    ``Projector(…, motion=…)``.
 
-    The source stands ``feed · (β − β₀) / 2π`` above ``start`` in the view of the angle β; angles go on beyond 2π.
+    The source stands ``feed · (β − β₀) / 2π`` above ``start`` in the view of the angle β; angles go
+    on beyond 2π.
 
     Args:
         geometry: cone beam, flat or curved.
@@ -306,7 +367,9 @@ def helical_motion(geometry: ConeBeam, feed: float, start: float = 0.0) -> Float
     """
     if not isinstance(geometry, ConeBeam):
         raise TypeError(f"a helix needs a ConeBeam, got {type(geometry).__name__}")
-    height = number("start", start) + number("feed", feed) * (geometry.angles - geometry.angles[0]) / (2 * math.pi)
+    height = number("start", start) + number("feed", feed) * (
+        geometry.angles - geometry.angles[0]
+    ) / (2 * math.pi)
     out = np.zeros((geometry.views, 3))
     out[:, 0] = -height
     return out
@@ -316,7 +379,9 @@ def _per_view(name: str, value: Any, views: int) -> Floats:
     """``(views, 1)`` of one number or one per view."""
     given = np.asarray(value, dtype=np.float64)
     if given.shape not in ((), (views,)) or not np.isfinite(given).all():
-        raise ValueError(f"{name} must be one finite number or one per view, ({views},), got shape {given.shape}")
+        raise ValueError(
+            f"{name} must be one finite number or one per view, ({views},), got shape {given.shape}"
+        )
     return np.broadcast_to(given, (views,))[:, None]
 
 
@@ -324,4 +389,6 @@ def _rotated(x: Floats, axis: Floats, angle: Floats) -> Floats:
     """Rodrigues' rotation of ``(views, 3)`` about axes of any length by ``(views, 1)`` rad."""
     axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
     c, s = np.cos(angle), np.sin(angle)
-    return np.asarray(x * c + np.cross(axis, x) * s + axis * (axis * x).sum(1, keepdims=True) * (1 - c))
+    return np.asarray(
+        x * c + np.cross(axis, x) * s + axis * (axis * x).sum(1, keepdims=True) * (1 - c)
+    )

@@ -31,8 +31,8 @@ class Panel:
         image: ``(rows, columns)`` HU; row 0 is drawn at the bottom, as y and z grow upwards.
         extent: ``(left, right, bottom, top)`` in mm.
         title: text above.
-        outlines: ``(mask, colour)`` pairs; the mask is drawn as an outline, same shape and extent as ``image``
-            or any other sampling of that extent.
+        outlines: ``(mask, colour)`` pairs; the mask is drawn as an outline, same shape and extent
+            as ``image`` or any other sampling of that extent.
         caption: text below.
     """
 
@@ -43,7 +43,12 @@ class Panel:
     caption: str = ""
 
 
-def panels(grid: Sequence[Sequence[Panel]], row_labels: Sequence[str] = (), title: str = "", footer: str = "") -> Any:
+def panels(
+    grid: Sequence[Sequence[Panel]],
+    row_labels: Sequence[str] = (),
+    title: str = "",
+    footer: str = "",
+) -> Any:
     """A matplotlib figure of panels with one grey scale (C150 / W600 HU) and a scale bar.
 
     Returns:
@@ -66,14 +71,23 @@ def panels(grid: Sequence[Sequence[Panel]], row_labels: Sequence[str] = (), titl
                 continue
             panel = grid[r][c]
             shown = ax.imshow(
-                np.asarray(panel.image), cmap="gray", vmin=low, vmax=high, origin="lower", extent=panel.extent,
+                np.asarray(panel.image),
+                cmap="gray",
+                vmin=low,
+                vmax=high,
+                origin="lower",
+                extent=panel.extent,
                 interpolation="nearest",
-            )  # fmt: skip
+            )
             for mask, colour in panel.outlines:
                 ax.contour(
-                    np.asarray(mask, dtype=float), levels=[0.5], colors=[colour], linewidths=0.9, origin="lower",
+                    np.asarray(mask, dtype=float),
+                    levels=[0.5],
+                    colors=[colour],
+                    linewidths=0.9,
+                    origin="lower",
                     extent=panel.extent,
-                )  # fmt: skip
+                )
             ax.set_title(panel.title, fontsize=8)
             if panel.caption:
                 ax.set_xlabel(panel.caption, fontsize=7)
@@ -99,25 +113,31 @@ _CODES = 65535
 
 
 def viewer_page(volumes: Sequence[tuple[str, Volume, float, float]], title: str) -> str:
-    """One HTML page, without network, in which a browser shows volumes side by side (``viewer.html``).
+    """One HTML page, without network, in which a browser shows volumes side by side
+    (``viewer.html``).
 
-    Values are rounded to a power of ten, at most 10 / 65533 of the volume's range: to 0.1 HU up to a range of 6553 HU.
+    Values are rounded to a power of ten, at most 10 / 65533 of the volume's range: to 0.1 HU up to
+    a range of 6553 HU.
 
     Args:
         volumes: label, volume, and level and width of its first grey scale.
         title: of the page.
 
     Raises:
-        ValueError: no volume, or lengths in different units (mm, pixels); a volume without a finite value; more voxels
-            than a browser holds.
+        ValueError: no volume, or lengths in different units (mm, pixels); a volume without a finite
+            value; more voxels than a browser holds.
     """
     lengths = {"pixels" if v.unit == "pixel^-1" else "mm" for _, v, _, _ in volumes}
     if len(lengths) != 1:
-        raise ValueError(f"a page shows volumes in one unit of length, got {' and '.join(sorted(lengths)) or 'none'}")
+        raise ValueError(
+            "a page shows volumes in one unit of length, got "
+            f"{' and '.join(sorted(lengths)) or 'none'}"
+        )
     voxels = sum(v.data.numel() for _, v, _, _ in volumes)
     if voxels > _MOST_VOXELS:
         raise ValueError(
-            f"{voxels / 1e6:.0f} million voxels are too many for one page (at most {_MOST_VOXELS / 1e6:.0f} million): "
+            f"{voxels / 1e6:.0f} million voxels are too many for one page (at most "
+            f"{_MOST_VOXELS / 1e6:.0f} million): "
             "show fewer volumes, or reconstruct a smaller extent or larger voxels"
         )
     about, data = [], []
@@ -133,22 +153,34 @@ def viewer_page(volumes: Sequence[tuple[str, Volume, float, float]], title: str)
         step = max(step, _LEAST_STEP_HU) if volume.unit == "HU" else step
         low = math.floor(low / step) * step
         codes = np.where(finite, np.rint((np.where(finite, values, low) - low) / step), _CODES)
-        split = codes.ravel().astype("<u2").view(np.uint8)  # low bytes before high ones: a tenth less than mixed
+        # low bytes before high ones: a tenth less than mixed
+        split = codes.ravel().astype("<u2").view(np.uint8)
         packed = zlib.compress(np.concatenate([split[::2], split[1::2]]).tobytes(), 9)
         data.append(f'<script id="data{number}" type="text/plain">{base64_text(packed)}</script>')
         grid = {"shape": flat.grid.shape, "spacing": flat.grid.spacing, "center": flat.grid.center}
         about.append(
-            {"label": label, "unit": flat.unit, **grid, "low": low, "step": step, "level": level, "width": width}
+            {
+                "label": label,
+                "unit": flat.unit,
+                **grid,
+                "low": low,
+                "step": step,
+                "level": level,
+                "width": width,
+            }
         )
     page = (resources.files("torchpcct") / "viewer.html").read_text(encoding="utf-8")
     for name, text in (
-        ("title", html.escape(title)), ("length", lengths.pop()), ("data", "\n".join(data)),
+        ("title", html.escape(title)),
+        ("length", lengths.pop()),
+        ("data", "\n".join(data)),
         ("volumes", json.dumps(about).replace("<", "\\u003c")),
-    ):  # fmt: skip
+    ):
         page = page.replace("{{" + name + "}}", text)
     return page
 
 
 def base64_text(content: bytes) -> str:
-    """Base64 for a page: broken where it would by chance read like an address, which browsers skip."""
+    """Base64 for a page: broken where it would by chance read like an address, which browsers
+    skip."""
     return base64.b64encode(content).decode().replace("http", "ht\ntp")

@@ -32,7 +32,8 @@ __all__ = ["Volume", "check_volume_name", "from_hu", "in_words", "to_hu"]
 
 @checked
 def to_hu(attenuation: Tensor, mu_water: float) -> Tensor:
-    """CT numbers from attenuation in mm⁻¹: 1000 (μ / μ_water − 1), so that water reads 0 and air −1000."""
+    """CT numbers from attenuation in mm⁻¹: 1000 (μ / μ_water − 1), so that water reads 0 and air
+    −1000."""
     return 1000.0 * (attenuation / mu_water - 1.0)
 
 
@@ -64,8 +65,9 @@ class Volume:
         data: ``(..., z, y, x)``, float32 or float64.
         grid: its voxel grid.
         report: how it was made: method, kernel, iterations, residual, seconds, …
-        unit: of ``data``: "HU", or "mm^-1" where the scan does not know the attenuation of water, "pixel^-1" where it
-            does not know the size of its cells (lengths of the grid are in pixels then).
+        unit: of ``data``: "HU", or "mm^-1" where the scan does not know the attenuation of water,
+            "pixel^-1" where it does not know the size of its cells (lengths of the grid are in
+            pixels then).
     """
 
     data: Tensor
@@ -75,42 +77,57 @@ class Volume:
 
     def __post_init__(self) -> None:
         if not isinstance(self.data, Tensor) or not self.data.is_floating_point():
-            raise TypeError(f"data must be a floating point tensor in HU, got {type(self.data).__name__}")
+            raise TypeError(
+                f"data must be a floating point tensor in HU, got {type(self.data).__name__}"
+            )
         if tuple(self.data.shape[-self.grid.ndim :]) != self.grid.shape:
             raise ValueError(f"data has shape {tuple(self.data.shape)}, its grid {self.grid.shape}")
         choice("unit", self.unit, UNITS)
 
     def __repr__(self) -> str:
-        low, high = (float(v) for v in self.data.detach().aminmax()) if self.data.numel() else (math.nan, math.nan)
+        low, high = (
+            (float(v) for v in self.data.detach().aminmax())
+            if self.data.numel()
+            else (math.nan, math.nan)
+        )
         size, how = " × ".join(map(str, self.data.shape)), self.report.get("method", "no method")
         return f"Volume({size}, {low:.4g} … {high:.4g} {self.unit}, {how}\n       {self.grid!r})"
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write ``.nii`` / ``.nii.gz`` (NIfTI-1), ``.mha`` (MetaImage), ``.h5`` (HDF5 with grid and report), ``.zarr``
-        (OME-Zarr 0.5), or, if the name has no ending, a folder with a DICOM series in HU.
+        """Write ``.nii`` / ``.nii.gz`` (NIfTI-1), ``.mha`` (MetaImage), ``.h5`` (HDF5 with grid and
+        report), ``.zarr`` (OME-Zarr 0.5), or, if the name has no ending, a folder with a DICOM
+        series in HU.
 
-        x, y, z of the scanner become right, anterior, superior. DICOM and OME-Zarr need the extra ``io``. A 2-D image
-        is written as :meth:`slices` makes it, but to HDF5, which keeps it as it is.
+        x, y, z of the scanner become right, anterior, superior. DICOM and OME-Zarr need the extra
+        ``io``. A 2-D image is written as :meth:`slices` makes it, but to HDF5, which keeps it as it
+        is.
 
         Raises:
-            ValueError: another ending, a batch of volumes (save them one by one), or what the format cannot hold.
+            ValueError: another ending, a batch of volumes (save them one by one), or what the
+                format cannot hold.
             ImportError: the package that writes the format is not installed.
         """
         check_volume_name(path)
         if self.data.ndim != self.grid.ndim:
-            raise ValueError(f"save one volume at a time, this one has shape {tuple(self.data.shape)}")
+            raise ValueError(
+                f"save one volume at a time, this one has shape {tuple(self.data.shape)}"
+            )
         form = format_of(path)
         if form == "HDF5":
             self._save_hdf5(path)
         else:
             write = {
-                "NIfTI": write_nifti, "MetaImage": write_meta_image, "DICOM": write_dicom, "OME-Zarr": write_ome_zarr
-            }[form]  # fmt: skip
+                "NIfTI": write_nifti,
+                "MetaImage": write_meta_image,
+                "DICOM": write_dicom,
+                "OME-Zarr": write_ome_zarr,
+            }[form]
             slices = self.slices()
             write(path, slices.data.detach().cpu().numpy(), slices.grid, self.unit)
 
     def slices(self) -> Volume:
-        """The same with axes z, y, x: a 2-D image as one slice at z = 0, as thick as its pixels are wide."""
+        """The same with axes z, y, x: a 2-D image as one slice at z = 0, as thick as its pixels
+        are wide."""
         if self.grid.ndim == 3:
             return self
         g = self.grid
@@ -123,34 +140,41 @@ class Volume:
             file.attrs["spacing_mm"] = self.grid.spacing
             file.attrs["center_mm"] = self.grid.center
             maps = {k: v for k, v in self.report.items() if isinstance(v, Tensor)}
-            file.attrs["report"] = json.dumps({k: v for k, v in self.report.items() if k not in maps}, default=str)
+            file.attrs["report"] = json.dumps(
+                {k: v for k, v in self.report.items() if k not in maps}, default=str
+            )
             file.create_dataset("data", data=self.data.detach().cpu().numpy())
             for name, values in maps.items():
                 file.create_dataset(f"maps/{name}", data=values.detach().cpu().numpy())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], unit: str | None = None) -> Volume:
-        """Read a volume of any format that :meth:`save` writes, or one DICOM image (``.dcm``, ``.ima``, no ending).
+        """Read a volume of any format that :meth:`save` writes, or one DICOM image (``.dcm``,
+        ``.ima``, no ending).
 
         The report comes back from HDF5 only.
 
         Args:
             path: file or folder.
-            unit: of its numbers, for files of other software, which do not say it: None: HU, and of DICOM only what is
-                said to be HU.
+            unit: of its numbers, for files of other software, which do not say it: None: HU, and of
+                DICOM only what is said to be HU.
 
         Raises:
             FileNotFoundError: no such file or folder.
-            ValueError: an unknown ending; a file that is damaged, foreign, oblique or incomplete, or says another unit.
+            ValueError: an unknown ending; a file that is damaged, foreign, oblique or incomplete,
+                or says another unit.
             ImportError: the package that reads the format is not installed.
         """
         if unit is not None:
             choice("unit", unit, UNITS)
         form = format_of(path)
         if form != "HDF5":
-            read = {"NIfTI": read_nifti, "MetaImage": read_meta_image, "DICOM": read_dicom, "OME-Zarr": read_ome_zarr}[
-                form
-            ]
+            read = {
+                "NIfTI": read_nifti,
+                "MetaImage": read_meta_image,
+                "DICOM": read_dicom,
+                "OME-Zarr": read_ome_zarr,
+            }[form]
             values, grid, said = read(path, unit)
             return cls(torch.from_numpy(values), grid, {"file": str(path)}, said)
         with read_hdf5(path, "volume") as file:
@@ -158,11 +182,15 @@ class Volume:
             check_expansion(held.shape, "the volume", held.id.get_storage_size, held.dtype.itemsize)
             data = torch.from_numpy(held[()])
             grid = VolumeGrid(
-                tuple(int(n) for n in data.shape), tuple(file.attrs["spacing_mm"]), tuple(file.attrs["center_mm"])
+                tuple(int(n) for n in data.shape),
+                tuple(file.attrs["spacing_mm"]),
+                tuple(file.attrs["center_mm"]),
             )
             said = str(file.attrs["unit"])
             if unit not in (None, said):
                 raise ValueError(f"it gives the unit {said!r}, not {unit!r}")
             report = json.loads(file.attrs["report"])
-            report |= {name: torch.from_numpy(values[()]) for name, values in file.get("maps", {}).items()}
+            report |= {
+                name: torch.from_numpy(values[()]) for name, values in file.get("maps", {}).items()
+            }
             return cls(data, grid, report, said)

@@ -1,8 +1,10 @@
-"""Command line: ``torchpcct train``, or ``torchrun --nproc_per_node=N -m recon.cli train`` for N processes.
+"""Command line: ``torchpcct train``, or ``torchrun --nproc_per_node=N -m recon.cli train`` for N
+processes.
 
 ``python -m train`` does the same where the user has no folder of that name.
 
-The numbers of threads are set before torch and numba are loaded, so this module imports all that needs them late.
+The numbers of threads are set before torch and numba are loaded, so this module imports all that
+needs them late.
 """
 
 from __future__ import annotations
@@ -35,20 +37,41 @@ def _parser() -> Parser:
 
     parser = Parser(
         prog="torchpcct train",
-        description="Train the unrolled reconstruction's prior on scenes that are made as it goes.\n"
+        description="Train the unrolled reconstruction's prior on scenes that are made as it "
+        "goes.\n"
         "Interrupt it at any moment: --resume continues bit for bit.",
-        epilog="examples:\n  torchpcct train --quick --out runs/first\n  torchpcct train --out runs/mine --resume\n"
-        "N processes share a step with\n  torchrun --nproc_per_node=N -m recon.cli train --out runs/mine\n",
+        epilog="examples:\n  torchpcct train --quick --out runs/first\n  torchpcct train --out "
+        "runs/mine --resume\n"
+        "N processes share a step with\n  torchrun --nproc_per_node=N -m recon.cli train --out "
+        "runs/mine\n",
     )
     many = {"limits": {"high": 10**9}}
     add_options(
         parser,
-        ("--config", Path, "FILE", "YAML file (default: train/configs/default.yaml)", {"read": True}),
+        (
+            "--config",
+            Path,
+            "FILE",
+            "YAML file (default: train/configs/default.yaml)",
+            {"read": True},
+        ),
         ("--quick", bool, None, "train/configs/quick.yaml: a look at whether it works"),
-        ("--out", Path, "PATH", "folder of the run (default runs/train)", {"default": Path("runs/train")}),
+        (
+            "--out",
+            Path,
+            "PATH",
+            "folder of the run (default runs/train)",
+            {"default": Path("runs/train")},
+        ),
         ("--resume", bool, None, "continue the run in --out"),
         ("--steps", int, "N", "optimisation steps, instead of the configuration's", many),
-        ("--seed", int, "N", "seed, instead of the configuration's", {"limits": {"low": 0, "high": 2**62}}),
+        (
+            "--seed",
+            int,
+            "N",
+            "seed, instead of the configuration's",
+            {"limits": {"low": 0, "high": 2**62}},
+        ),
         (
             "--weights",
             Path,
@@ -56,20 +79,28 @@ def _parser() -> Parser:
             "start from the weights of another run, of a network as wide or less",
             {"read": True},
         ),
-        ("--threads", int, "N", "threads per process (default: torch's choice)", {"limits": {"high": MOST}}),
+        (
+            "--threads",
+            int,
+            "N",
+            "threads per process (default: torch's choice)",
+            {"limits": {"high": MOST}},
+        ),
         ("--device", str, "NAME", "where it trains: cpu (default) or cuda", {"default": "cpu"}),
         (
             "--views",
             Path,
             "PATH",
-            "folder of what the network sees of the scenes, several GB; runs of one seed and the same data share it "
+            "folder of what the network sees of the scenes, several GB; runs of one seed and the "
+            "same data share it "
             "(default: the folder views in --out)",
         ),
         (
             "--painters",
             int,
             "N",
-            "processes that make all views beforehand (default: each is made when it is first used; needed for the "
+            "processes that make all views beforehand (default: each is made when it is first "
+            "used; needed for the "
             "speed of a GPU)",
             {"limits": {"high": MOST}},
         ),
@@ -79,7 +110,9 @@ def _parser() -> Parser:
     return parser
 
 
-def build(config: TrainConfig, views: Path, device: str = "cpu") -> tuple[Unrolled, Data, Data, Objective]:
+def build(
+    config: TrainConfig, views: Path, device: str = "cpu"
+) -> tuple[Unrolled, Data, Data, Objective]:
     """Model with its starting weights, data of the training and of the validation, and objective.
 
     Args:
@@ -90,7 +123,8 @@ def build(config: TrainConfig, views: Path, device: str = "cpu") -> tuple[Unroll
     A network of a user's own is imported, as the configuration names it.
 
     Raises:
-        ValueError: a device that torch does not have here; a network that cannot be imported or trained.
+        ValueError: a device that torch does not have here; a network that cannot be imported or
+            trained.
         TypeError: a class that makes no module, or whose modules do not take what a prior is given.
     """
     import torch
@@ -104,11 +138,15 @@ def build(config: TrainConfig, views: Path, device: str = "cpu") -> tuple[Unroll
     try:
         where = torch.zeros((), device=device).device
     except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"no device {device!r} here: take cpu, or cuda on a machine with a GPU ({error})") from error
+        raise ValueError(
+            f"no device {device!r} here: take cpu, or cuda on a machine with a GPU ({error})"
+        ) from error
     torch.manual_seed(config.seed)
     named = config.network.get("class")
     network = network_of(config.network, named)
-    model = Unrolled(network, steps=config.unroll, voxel_mm=None if named is None else config.data.voxel_mm)
+    model = Unrolled(
+        network, steps=config.unroll, voxel_mm=None if named is None else config.data.voxel_mm
+    )
     if named is not None:
         _require_trainable(named, model, network, config.data.shape)
     model.to(where)
@@ -121,8 +159,11 @@ def build(config: TrainConfig, views: Path, device: str = "cpu") -> tuple[Unroll
     return model, data, held_out, Objective(config.objective, config.single)
 
 
-def _require_trainable(name: str, model: Unrolled, network: nn.Module, shape: Sequence[int]) -> None:
-    """Refuse a network of a user's own that no training can use, before anything is written (ValueError, TypeError)."""
+def _require_trainable(
+    name: str, model: Unrolled, network: nn.Module, shape: Sequence[int]
+) -> None:
+    """Refuse a network of a user's own that no training can use, before anything is written
+    (ValueError, TypeError)."""
     import torch
 
     from recon.mbir.priors import same_kind
@@ -138,7 +179,9 @@ def _require_trainable(name: str, model: Unrolled, network: nn.Module, shape: Se
         with torch.no_grad():
             made = network.eval()(volumes, volumes, torch.zeros((2, 3)), volumes)
     except (RuntimeError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise ValueError(f"network {name} must take {takes}, volumes of {tuple(volumes.shape)}: {error}") from error
+        raise ValueError(
+            f"network {name} must take {takes}, volumes of {tuple(volumes.shape)}: {error}"
+        ) from error
     finally:
         network.train(was)
     same_kind(made, volumes, network)
@@ -181,12 +224,16 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
             config = TrainConfig.from_yaml(Store(arguments.out).load()[1]["config"])
             if "class" in config.network:
                 raise ValueError(
-                    f"the run in {arguments.out} trains {config.network['class']}, which no file alone may import: if "
-                    f"you trust it, name its configuration, --config {shlex.quote(str(arguments.out / 'config.yaml'))}"
+                    f"the run in {arguments.out} trains {config.network['class']}, which no file "
+                    "alone may import: if "
+                    "you trust it, name its configuration, --config "
+                    f"{shlex.quote(str(arguments.out / 'config.yaml'))}"
                 )
         else:
             config = packaged_config("quick" if arguments.quick else "default")
-        changes = {k: v for k, v in (("steps", arguments.steps), ("seed", arguments.seed)) if v is not None}
+        changes = {
+            k: v for k, v in (("steps", arguments.steps), ("seed", arguments.seed)) if v is not None
+        }
         config = replace(config, **changes)
         if "class" in config.network:
             find_modules_here()
@@ -224,8 +271,11 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
         return 128 + number if number else 1
     skipped = f", {state.skipped} steps skipped" if state.skipped else ""
     score = f"{state.best['score']:.5g}" if state.best else "none"
-    print(f"{state.step} steps in {state.seconds / 60:.1f} min{skipped}; best validation score {score}; "
-          f"weights and card in {arguments.out}")  # fmt: skip
+    print(
+        f"{state.step} steps in {state.seconds / 60:.1f} min{skipped}; best validation score "
+        f"{score}; "
+        f"weights and card in {arguments.out}"
+    )
     return 0
 
 
@@ -235,8 +285,8 @@ def _failed(text: str, status: int) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status: 0 done, 1 diverged or not finished, 2 refused input, 128 + signal
-    after an interruption."""
+    """Run the command line; returns the exit status: 0 done, 1 diverged or not finished, 2 refused
+    input, 128 + signal after an interruption."""
     from recon.cli.parsing import check_limits
 
     words = list(sys.argv[1:] if argv is None else argv)
@@ -253,7 +303,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error("--config and --quick exclude each other")
     if arguments.weights is not None and arguments.resume:
         parser.error("--weights starts a new run; --resume continues one")
-    # Before torch loads: OpenMP threads that wait should sleep, on machines shared with others by far the faster way.
+    # Before torch loads: OpenMP threads that wait should sleep, on machines shared with others by
+    # far the faster way.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if arguments.threads is not None:
         os.environ["OMP_NUM_THREADS"] = os.environ["NUMBA_NUM_THREADS"] = str(arguments.threads)
@@ -263,7 +314,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _run(arguments, shlex.join(["torchpcct", "train", *words]))
     except KeyboardInterrupt:
         # The second Ctrl-C, or one before the first step.
-        print(f"stopped at once; --resume continues from the last checkpoint in {arguments.out}", file=sys.stderr)
+        print(
+            f"stopped at once; --resume continues from the last checkpoint in {arguments.out}",
+            file=sys.stderr,
+        )
         return 130
 
 

@@ -1,8 +1,9 @@
 """Configuration of a training run and its YAML form.
 
-A YAML file holds the fields that differ from the defaults of :class:`TrainConfig`. Sections (``network``, ``data``,
-``objective``) are mappings. Unknown keys are errors, so that a misspelt one does not silently train the default. Every
-class checks its own values, whether they come from YAML or from Python.
+A YAML file holds the fields that differ from the defaults of :class:`TrainConfig`. Sections
+(``network``, ``data``, ``objective``) are mappings. Unknown keys are errors, so that a misspelt one
+does not silently train the default. Every class checks its own values, whether they come from YAML
+or from Python.
 """
 
 from __future__ import annotations
@@ -22,7 +23,15 @@ from torchpcct.formats.damage import yaml_values
 from torchpcct.validate import checked, number, numbers, whole
 from train.scenes.scene import SceneConfig
 
-__all__ = ["DataConfig", "ObjectiveConfig", "Situation", "TrainConfig", "differences", "load_config", "packaged_config"]
+__all__ = [
+    "DataConfig",
+    "ObjectiveConfig",
+    "Situation",
+    "TrainConfig",
+    "differences",
+    "load_config",
+    "packaged_config",
+]
 
 LONGEST_INTERVAL = 120.0
 """Largest ``checkpoint_seconds``: what a killed run may lose, in s."""
@@ -85,7 +94,12 @@ class Situation:
 
     def __post_init__(self) -> None:
         _set(self, x=number("x", self.x), y=number("y", self.y))
-        _set(self, **{k: number(k, getattr(self, k), positive=True) for k in ("patient_mm", "pitch_scale")})
+        _set(
+            self,
+            **{
+                k: number(k, getattr(self, k), positive=True) for k in ("patient_mm", "pitch_scale")
+            },
+        )
 
 
 _SITUATIONS = (
@@ -104,18 +118,22 @@ class DataConfig:
 
     Args:
         shape: voxels of the training inset (z, y, x).
-        voxel_mm: voxel size; 0.2 is the one that :func:`recon.mbir.reconstruct.reconstruct_mbir` works at.
+        voxel_mm: voxel size; 0.2 is the one that :func:`recon.mbir.reconstruct.reconstruct_mbir`
+            works at.
         exposure_s: range of the exposure, log-uniform.
-        views: views of the scans whose Gram operators are taken (their exposure is that of the whole scan).
+        views: views of the scans whose Gram operators are taken (their exposure is that of the
+            whole scan).
         situations: one Gram operator each; one is drawn per step.
         scenes: changes of :class:`train.scenes.scene.SceneConfig`.
-        scenes_kept: different scenes, each with an exposure, two noise draws and a volume without noise; what the
-            network sees of them is computed once and kept in a file, 1.1 MB a scene of the usual shape.
+        scenes_kept: different scenes, each with an exposure, two noise draws and a volume without
+            noise; what the network sees of them is computed once and kept in a file, 1.1 MB a scene
+            of the usual shape.
         core_roi, tissue_roi: ranges of the radii of the random ROIs, mm.
         flat_roi: share of ROIs that are discs of one slice, as in an axial image, instead of balls.
 
     Raises:
-        TypeError, ValueError: a value is out of its range, or ``scenes`` or a situation has an unknown key.
+        TypeError, ValueError: a value is out of its range, or ``scenes`` or a situation has an
+            unknown key.
     """
 
     shape: tuple[int, int, int] = (40, 32, 32)
@@ -140,14 +158,18 @@ class DataConfig:
             shape=tuple(whole(f"shape[{i}]", n) for i, n in enumerate(self.shape)),
             voxel_mm=number("voxel_mm", self.voxel_mm, positive=True),
             views=whole("views", self.views),
-            situations=tuple(_section(Situation, s, f"situations[{i}]") for i, s in enumerate(self.situations)),
+            situations=tuple(
+                _section(Situation, s, f"situations[{i}]") for i, s in enumerate(self.situations)
+            ),
             scenes_kept=whole("scenes_kept", self.scenes_kept),
             flat_roi=number("flat_roi", self.flat_roi, low=0.0, high=1.0),
         )
         for name in ("exposure_s", "core_roi", "tissue_roi"):
             low, high = numbers(name, getattr(self, name), 2, positive=True)
             if low > high:
-                raise ValueError(f"{name} must be a range, the lower end first, got {getattr(self, name)}")
+                raise ValueError(
+                    f"{name} must be a range, the lower end first, got {getattr(self, name)}"
+                )
             _set(self, **{name: (low, high)})
 
 
@@ -157,13 +179,14 @@ class ObjectiveConfig:
 
     Args:
         data: of eᵀH e.
-        white: of ‖e‖², against ``data``; edge: by how much more within two voxels of an edge; body: in
-            bodies and one voxel about them; flat: in bodies, where the truth is constant for three voxels around, such
-            as deep in a lumen; flat_from: share of the training after which ``flat`` counts.
-        noise_free: of ``data`` and ``white`` of the same scene without noise, against those with noise: what is left
-            there is blur and overshoot.
-        contrast: of the ROI contrasts' errors at fidelity 1; viewing: share of it that is left at fidelity 0, linear
-            between.
+        white: of ‖e‖², against ``data``; edge: by how much more within two voxels of an edge; body:
+            in bodies and one voxel about them; flat: in bodies, where the truth is constant for
+            three voxels around, such as deep in a lumen; flat_from: share of the training after
+            which ``flat`` counts.
+        noise_free: of ``data`` and ``white`` of the same scene without noise, against those with
+            noise: what is left there is blur and overshoot.
+        contrast: of the ROI contrasts' errors at fidelity 1; viewing: share of it that is left at
+            fidelity 0, linear between.
         bias: κ at fidelity 0 and at fidelity 1, linear between.
         contrast_sd: an ROI contrast error, in noise units, that counts as 1.
         fidelities: range of the fidelity, uniform.
@@ -195,7 +218,10 @@ class ObjectiveConfig:
         _set(self, contrast_sd=number("contrast_sd", self.contrast_sd, positive=True))
         first, last = numbers("bias", self.bias, 2)
         if not (first >= 0 and last >= 0):
-            raise ValueError(f"bias must be two weights of at least 0, of fidelity 0 and fidelity 1, got {self.bias}")
+            raise ValueError(
+                "bias must be two weights of at least 0, of fidelity 0 and fidelity 1, got "
+                f"{self.bias}"
+            )
         _set(self, bias=(first, last))
         low, high = numbers("fidelities", self.fidelities, 2)
         if not 0 <= low <= high <= 1:
@@ -206,31 +232,37 @@ class ObjectiveConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """A training run. Everything in it is counted in steps, so that the result does not depend on the machine's speed.
+    """A training run. Everything in it is counted in steps, so that the result does not depend on
+    the machine's speed.
 
     Args:
         seed: of the weights' start, the data and the validation, ≥ 0.
         steps: optimisation steps.
         batch: scenes of a step, over all processes.
         learning_rate: of Adam, at the end of the warm-up.
-        warmup: steps over which it rises linearly; it counts only steps that change the weights, as the average does.
-        decay: share of the steps, at the end, over which the learning rate falls along a cosine; before, it is
-            constant, and a run may be resumed with other ``steps``.
+        warmup: steps over which it rises linearly; it counts only steps that change the weights, as
+            the average does.
+        decay: share of the steps, at the end, over which the learning rate falls along a cosine;
+            before, it is constant, and a run may be resumed with other ``steps``.
         final_fraction: of ``learning_rate`` that the cosine ends with, 0 to 1.
-        clip: largest norm of the gradient of the mean loss; longer ones are shortened to it. ``inf`` for none.
-        ema: decay per step of the exponential moving average of the weights, in [0, 1); the average is what is
-            validated and shipped. Early in a run the decay is smaller, ``(1 + n) / (10 + n)`` after n steps.
+        clip: largest norm of the gradient of the mean loss; longer ones are shortened to it.
+            ``inf`` for none.
+        ema: decay per step of the exponential moving average of the weights, in [0, 1); the average
+            is what is validated and shipped. Early in a run the decay is smaller, ``(1 + n) / (10 +
+            n)`` after n steps.
         checkpoint_seconds: time between checkpoints in s, ≤ 120.
         validate_every: steps between validations; the last step is always validated.
         log_every: steps between rows of the log.
-        network: arguments of :class:`recon.mbir.network.NetworkConfig`. Or of a network of a user's own: ``class``, its
-            ``package.module:Class``, and the arguments of that; without arguments its name alone. It is imported when
-            the training begins, not here.
+        network: arguments of :class:`recon.mbir.network.NetworkConfig`. Or of a network of a user's
+            own: ``class``, its ``package.module:Class``, and the arguments of that; without
+            arguments its name alone. It is imported when the training begins, not here.
         unroll: steps K of :class:`recon.mbir.unrolled.Unrolled`.
-        single: share of the training with one step of the K: the network is the same in all, and one is cheaper.
-        bfloat16: convolve in that precision where the processor has it, in half the time (others would imitate it, at
-            twenty times the time, and convolve in float32).
-        data, objective: :class:`DataConfig` and :class:`ObjectiveConfig`, or mappings of their fields.
+        single: share of the training with one step of the K: the network is the same in all, and
+            one is cheaper.
+        bfloat16: convolve in that precision where the processor has it, in half the time (others
+            would imitate it, at twenty times the time, and convolve in float32).
+        data, objective: :class:`DataConfig` and :class:`ObjectiveConfig`, or mappings of their
+            fields.
 
     Raises:
         TypeError, ValueError: a value is out of its range, or a section has an unknown key.
@@ -256,7 +288,15 @@ class TrainConfig:
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
 
     def __post_init__(self) -> None:
-        lowest = {"seed": 0, "steps": 1, "batch": 1, "warmup": 0, "validate_every": 1, "log_every": 1, "unroll": 1}
+        lowest = {
+            "seed": 0,
+            "steps": 1,
+            "batch": 1,
+            "warmup": 0,
+            "validate_every": 1,
+            "log_every": 1,
+            "unroll": 1,
+        }
         for name, least in lowest.items():
             whole(name, getattr(self, name), least)
         _set(
@@ -289,7 +329,8 @@ class TrainConfig:
         """From YAML; fields left out keep their defaults.
 
         Raises:
-            ValueError: not a mapping of known keys to values of the right kind and range; the message names the key.
+            ValueError: not a mapping of known keys to values of the right kind and range; the
+                message names the key.
         """
         values = yaml_values(text)
         config: Self = _section(cls, {} if values is None else values, "")
@@ -329,7 +370,8 @@ def packaged_config(name: str) -> TrainConfig:
 
 @checked
 def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
-    """Names in which two configurations, as plain values, differ, with a dot after the name of a section."""
+    """Names in which two configurations, as plain values, differ, with a dot after the name of a
+    section."""
     a, b = _flat(first), _flat(second)
     missing = object()
     return sorted(key for key in a.keys() | b.keys() if a.get(key, missing) != b.get(key, missing))
@@ -338,5 +380,7 @@ def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     out: dict[str, Any] = {}
     for key, value in values.items():
-        out.update(_flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value})
+        out.update(
+            _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+        )
     return out

@@ -1,12 +1,15 @@
-"""Training data without a projector in the loop: random scenes, and the statistic AᵀW y drawn through Gram operators.
+"""Training data without a projector in the loop: random scenes, and the statistic AᵀW y drawn
+through Gram operators.
 
-For a scene x and an exposure, β = H x + noise of covariance H is distributed as AᵀW y of a scan (up to the model error
-of the Gram operator, see :mod:`recon.gram.gram`), so thousands of scans a minute cost a few FFTs. The Gram operators
-are those of real scanners: several inset positions, patient sizes and pitches, each made when it is first asked for.
+For a scene x and an exposure, β = H x + noise of covariance H is distributed as AᵀW y of a scan (up
+to the model error of the Gram operator, see :mod:`recon.gram.gram`), so thousands of scans a minute
+cost a few FFTs. The Gram operators are those of real scanners: several inset positions, patient
+sizes and pitches, each made when it is first asked for.
 
-What the network sees of a scan, its *views*, does not depend on any weight. It is computed when a scene is first used,
-kept in a file (:class:`Views`) in half precision, and read from there in every later epoch, mirrored and turned at
-random. A scene has one exposure, two independent noise draws and one volume without noise.
+What the network sees of a scan, its *views*, does not depend on any weight. It is computed when a
+scene is first used, kept in a file (:class:`Views`) in half precision, and read from there in every
+later epoch, mirrored and turned at random. A scene has one exposure, two independent noise draws
+and one volume without noise.
 """
 
 from __future__ import annotations
@@ -60,12 +63,17 @@ ROIS = 3
 VOLUMES = 3
 """Of each scene: two noise draws and one volume without noise."""
 BODY_HU = 15.0
-"""What differs by more from the background is a body; where values differ by more there is an edge."""
+"""What differs by more from the background is a body; where values differ by more there is an
+edge."""
 FORMAT = "torchpcct training views 1"
 _DRAWS_OF_ROI = 6
 """Random numbers that a small ROI takes."""
-_SIGNAL, _AROUND, _EDGE, _BODY = 1, 2, 4, 8
-"""Bits of a scene's labels: wholly in the signal, wholly in the tissue around it, near an edge, in or near a body."""
+_SIGNAL = 1
+_AROUND = 2
+_EDGE = 4
+_BODY = 8
+"""Bits of a scene's labels: wholly in the signal, wholly in the tissue around it, near an edge,
+in or near a body."""
 _PIECE = 64
 """Scenes that a process paints before it gives them back."""
 _LEFT_FREE = 0.4
@@ -79,8 +87,8 @@ class Sample:
     """One scene as it is kept.
 
     Args:
-        views: ``(3, 4, z, y, x)`` float16: of every volume start, step towards the data, its filtered view, and β, all
-            in noise units.
+        views: ``(3, 4, z, y, x)`` float16: of every volume start, step towards the data, its
+            filtered view, and β, all in noise units.
         truth: ``(z, y, x)`` float16, HU above the background.
         labels: ``(z, y, x)`` uint8.
         exposure: s.
@@ -93,7 +101,9 @@ class Sample:
 
     def to(self, device: torch.device | str) -> Sample:
         """The same on a device."""
-        return Sample(self.views.to(device), self.truth.to(device), self.labels.to(device), self.exposure)
+        return Sample(
+            self.views.to(device), self.truth.to(device), self.labels.to(device), self.exposure
+        )
 
 
 @dataclass(frozen=True)
@@ -104,12 +114,14 @@ class Batch:
         problem: of ``3 · size`` volumes: the first draws of all scenes, the second ones, no noise.
         views: of the problem, :func:`recon.mbir.unrolled.first_views`.
         truth: ``(size, z, y, x)`` HU above the background.
-        edges, bodies: ``(size, z, y, x)``, 1 near edges of the truth, and in bodies and one voxel about them, else 0.
-        contrast: ``(size, rois, z, y, x)`` weights of ROI contrasts: mean over a core (or of plain tissue) less mean
-            over the tissue around it, random small parts of both, last all of both; 0 where the scene offers none.
+        edges, bodies: ``(size, z, y, x)``, 1 near edges of the truth, and in bodies and one voxel
+            about them, else 0.
+        contrast: ``(size, rois, z, y, x)`` weights of ROI contrasts: mean over a core (or of plain
+            tissue) less mean over the tissue around it, random small parts of both, last all of
+            both; 0 where the scene offers none.
         voxels: ``(size, rois)`` voxels of the smaller ROI, 0 if none.
-        lots: ``(size, 2)`` random numbers in 0 … 1 of each scene, for its fidelity and whether it is also seen without
-            noise.
+        lots: ``(size, 2)`` random numbers in 0 … 1 of each scene, for its fidelity and whether it
+            is also seen without noise.
         turned: a volume as the network shall see it, mirrored; unturned: the inverse.
     """
 
@@ -140,15 +152,17 @@ class Batch:
 class Views:
     """A file of samples: each is written when it has been computed, and says so.
 
-    Several processes may use one folder. Files are made at their full length, so that a disk that is too small is
-    noticed at the start. They are found by a digest of all that the samples depend on.
+    Several processes may use one folder. Files are made at their full length, so that a disk that
+    is too small is noticed at the start. They are found by a digest of all that the samples depend
+    on.
 
     Args:
         folder: of the files, made if missing.
         config: of the samples; seed: of the run.
 
     Raises:
-        OSError: the folder cannot be written, or the disk has no room; the message says how much is needed.
+        OSError: the folder cannot be written, or the disk has no room; the message says how much is
+            needed.
     """
 
     def __init__(self, folder: Path, config: DataConfig, seed: int) -> None:
@@ -186,13 +200,19 @@ class Views:
             except OSError as error:
                 if error.errno != errno.ENOSPC:
                     raise
-                text = f"no room for {size / 1e9:.1f} GB of views in {self.folder}: name another folder with --views"
+                text = (
+                    f"no room for {size / 1e9:.1f} GB of views in {self.folder}: name another "
+                    "folder with --views"
+                )
                 raise OSError(errno.ENOSPC, text + ", or a smaller data.scenes_kept") from error
             finally:
                 part.unlink(missing_ok=True)
         found = np.load(path, mmap_mode="r+", allow_pickle=False)
         if found.shape != shape or found.dtype != kind:
-            raise ValueError(f"{path} is damaged: it holds {found.dtype} of shape {found.shape}; remove the folder")
+            raise ValueError(
+                f"{path} is damaged: it holds {found.dtype} of shape {found.shape}; remove the "
+                "folder"
+            )
         return found
 
     def __len__(self) -> int:
@@ -202,7 +222,9 @@ class Views:
         return bool(self._arrays["done"][number])
 
     def __getitem__(self, number: int) -> Sample:
-        views, truth, labels = (torch.from_numpy(self._arrays[k][number]) for k in ("views", "truth", "labels"))
+        views, truth, labels = (
+            torch.from_numpy(self._arrays[k][number]) for k in ("views", "truth", "labels")
+        )
         return Sample(views, truth, labels, float(self._arrays["exposure"][number]))
 
     def __setitem__(self, number: int, sample: Sample) -> None:
@@ -224,7 +246,9 @@ class Data:
         folder: of the views.
     """
 
-    def __init__(self, config: DataConfig, seed: int, folder: Path, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self, config: DataConfig, seed: int, folder: Path, device: torch.device | str = "cpu"
+    ) -> None:
         self.config = config
         self.seed = seed
         self.device = torch.device(device)
@@ -245,7 +269,8 @@ class Data:
         """Compute all views beforehand; else they are computed when a scene is first used.
 
         Args:
-            processes: that paint the scenes. Without a GPU they compute the views, too; a GPU does that by itself.
+            processes: that paint the scenes. Without a GPU they compute the views, too; a GPU does
+                that by itself.
         """
         numbers = [n for n in range(len(self.views)) if n not in self.views]
         # All scenes of a situation in one process: each makes its Gram operator once.
@@ -266,11 +291,15 @@ class Data:
         return number % len(self.config.situations)
 
     def sample(self, number: int) -> Sample:
-        """A scene of the pool, from the file or computed and kept there; on a GPU it stays while there is room."""
+        """A scene of the pool, from the file or computed and kept there; on a GPU it stays while
+        there is room."""
         if number in self._on_device:
             return self._on_device[number]
         if number not in self.views:
-            return self._keep(number, self._seen(number, *painted(self.config, seed_of("scene", self.seed, number))))
+            return self._keep(
+                number,
+                self._seen(number, *painted(self.config, seed_of("scene", self.seed, number))),
+            )
         sample = self.views[number]
         return sample if not self._accelerated else self._hold(number, sample.to(self.device))
 
@@ -300,7 +329,9 @@ class Data:
         problem = NormalisedProblem.from_statistic(gram, b, exposures, hu, c.voxel_mm)
         found = first_views(problem, bilateral=True)
         views = torch.stack([*(v for v in found if v is not None), problem.beta], 1)
-        return Sample(views.to(torch.float16), truth.to(torch.float16), labels, exposure).to(self.device)
+        return Sample(views.to(torch.float16), truth.to(torch.float16), labels, exposure).to(
+            self.device
+        )
 
     def batches_in_epoch(self, batch: int) -> int:
         """Batches of an epoch; scenes that fill none are left out of it."""
@@ -308,7 +339,8 @@ class Data:
         return sum(len(range(k, len(self.views), kinds)) // batch for k in range(kinds))
 
     def numbers(self, step: int, batch: int) -> list[int]:
-        """The scenes of a step, all of one situation; an epoch takes every scene once, in an order of its own."""
+        """The scenes of a step, all of one situation; an epoch takes every scene once, in an
+        order of its own."""
         epoch, index = divmod(step, self.batches_in_epoch(batch))
         if self._epoch[0] != (epoch, batch):
             rng = np.random.default_rng(seed_of("epoch", self.seed, epoch))
@@ -332,17 +364,25 @@ class Data:
         numbers = self.numbers(step, batch)
         gram, hu = self.gram(self._situation(numbers[0]))
         samples = [self.sample(numbers[i]) for i in indices]
-        generators = [torch.Generator().manual_seed(seed_of("step", self.seed, step, i)) for i in indices]
-        random = torch.stack([torch.rand(2 + (ROIS - 1) * _DRAWS_OF_ROI, generator=g) for g in generators])
+        generators = [
+            torch.Generator().manual_seed(seed_of("step", self.seed, step, i)) for i in indices
+        ]
+        random = torch.stack(
+            [torch.rand(2 + (ROIS - 1) * _DRAWS_OF_ROI, generator=g) for g in generators]
+        )
         random = random.to(self.device)
-        # ``(volume, scene)`` is the order of a batch: the first draws of all scenes, the second ones, no noise.
+        # ``(volume, scene)`` is the order of a batch: the first draws of all scenes, the second
+        # ones, no noise.
         views = torch.stack([s.views for s in samples], 1).float().flatten(0, 1)
         truth = torch.stack([s.truth for s in samples]).float()
         labels = torch.stack([s.labels for s in samples])
         exposure = torch.tensor([s.exposure for s in samples], device=self.device).repeat(VOLUMES)
         problem = NormalisedProblem.with_beta(gram, views[:, 3], exposure, hu, c.voxel_mm)
         signal, around = labels & _SIGNAL > 0, labels & _AROUND > 0
-        found = [_random_contrasts(signal, around, c, part) for part in random[:, 2:].split(_DRAWS_OF_ROI, 1)]
+        found = [
+            _random_contrasts(signal, around, c, part)
+            for part in random[:, 2:].split(_DRAWS_OF_ROI, 1)
+        ]
         found.append(_whole_contrasts(signal, around))
         contrast, voxels = (torch.stack(v, 1) for v in zip(*found, strict=True))
         return Batch(
@@ -367,11 +407,16 @@ def _compute_views(config: DataConfig, seed: int, folder: Path, numbers: Sequenc
 
 def _paint(config: DataConfig, seed: int, numbers: Sequence[int]) -> list[list[NDArray[Any]]]:
     """Scenes for another process, which computes their views."""
-    return [[v.numpy() for v in painted(config, seed_of("scene", seed, number))] for number in numbers]
+    return [
+        [v.numpy() for v in painted(config, seed_of("scene", seed, number))] for number in numbers
+    ]
 
 
-def turn(number: int, square: bool) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
-    """One of the mirror images along three axes, y and x exchanged or not (``square``), and its inverse."""
+def turn(
+    number: int, square: bool
+) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
+    """One of the mirror images along three axes, y and x exchanged or not (``square``), and its
+    inverse."""
     axes = [axis for k, axis in enumerate((-3, -2, -1)) if number >> k & 1]
     exchanged = square and bool(number >> 3)
 
@@ -386,7 +431,8 @@ def turn(number: int, square: bool) -> tuple[Callable[[Tensor], Tensor], Callabl
 
 
 def painted(config: DataConfig, seed: int) -> tuple[Tensor, Tensor, Tensor]:
-    """A random scene, ``(z, y, x)`` each: what a scan holds of it and the truth, HU above the background; labels."""
+    """A random scene, ``(z, y, x)`` each: what a scan holds of it and the truth, HU above the
+    background; labels."""
     nz, ny, nx = config.shape
     z, y, x = (round(n * config.voxel_mm, 6) for n in (nz, ny, nx))
     scene = draw_scene(seed, (z, y, x), SceneConfig(**config.scenes))
@@ -411,18 +457,23 @@ def _edges(truth: Tensor) -> Tensor:
 
 
 def situation_gram(situation: Situation, config: DataConfig) -> tuple[Gram, float]:
-    """The Gram operator of the training inset in one situation, per second of exposure, and 1 HU in mm⁻¹."""
+    """The Gram operator of the training inset in one situation, per second of exposure, and 1 HU
+    in mm⁻¹."""
     scanner = presets.pcct(views=config.views)
     g = scanner.geometry
-    scanner = replace(scanner, geometry=replace(g, pitch=tuple(p * situation.pitch_scale for p in g.pitch)))
-    patient = Scene((Body("patient", EllipticCylinder(situation.patient_mm / 2), "pericoronary_fat"),))
+    scanner = replace(
+        scanner, geometry=replace(g, pitch=tuple(p * situation.pitch_scale for p in g.pitch))
+    )
+    patient = Scene(
+        (Body("patient", EllipticCylinder(situation.patient_mm / 2), "pericoronary_fat"),)
+    )
     grid = VolumeGrid(config.shape, config.voxel_mm, (0.0, situation.y, situation.x))
     clean = acquire(patient, scanner, region=grid)
     problem = InsetProblem(clean, grid, nodes=1)
     return problem.gram, problem.mu_ref / 1000.0
 
 
-# -- of a whole batch: masks ``(n, z, y, x)``, random numbers in 0 … 1 ``(n, k)`` -------------------------------------
+# -- of a whole batch: masks ``(n, z, y, x)``, random numbers in 0 … 1 ``(n, k)`` ------------------
 
 
 def _chosen(which: Tensor, yes: Tensor, no: Tensor) -> Tensor:
@@ -435,10 +486,13 @@ def _size(mask: Tensor) -> Tensor:
 
 
 def _contrasts(first: Tensor, second: Tensor, least: int) -> tuple[Tensor, Tensor]:
-    """Mean over one mask less mean over the other, and the voxels of the smaller; 0 where one has too few."""
+    """Mean over one mask less mean over the other, and the voxels of the smaller; 0 where one
+    has too few."""
     n, m = _size(first), _size(second)
     enough = (n >= least) & (m >= least)
-    one, other = (mask / size.clamp_min(1).reshape(-1, 1, 1, 1) for mask, size in ((first, n), (second, m)))
+    one, other = (
+        mask / size.clamp_min(1).reshape(-1, 1, 1, 1) for mask, size in ((first, n), (second, m))
+    )
     return _chosen(enough, one - other, torch.zeros_like(one)), torch.minimum(n, m) * enough.float()
 
 
@@ -447,14 +501,17 @@ def _whole_contrasts(core: Tensor, tissue: Tensor) -> tuple[Tensor, Tensor]:
     return _contrasts(core, tissue & core.any(3).any(2)[:, :, None, None], 8)
 
 
-def _random_contrasts(inside: Tensor, around: Tensor, config: DataConfig, random: Tensor) -> tuple[Tensor, Tensor]:
+def _random_contrasts(
+    inside: Tensor, around: Tensor, config: DataConfig, random: Tensor
+) -> tuple[Tensor, Tensor]:
     """A random part of ``inside`` against one of ``around``."""
     flat, size, place, margin, other_size, other_place = random.unbind(1)
     inside = _chosen(inside.flatten(1).any(1), inside, around)
     first = _ball(inside, config.core_roi, config.voxel_mm, size, place) & inside
     # Where there is no core, both lie in the same tissue: voxels of both would cancel.
     around = around & ~first
-    # The tissue next to the core is what the study's background ROI lies in, and hardest: half of all draws.
+    # The tissue next to the core is what the study's background ROI lies in, and hardest: half of
+    # all draws.
     near = around & _within(first, 0.7 + 0.5 * margin, config.voxel_mm)
     near = _chosen(near.flatten(1).any(1), near, around)
     second = _ball(near, config.tissue_roi, config.voxel_mm, other_size, other_place) & around
@@ -463,13 +520,17 @@ def _random_contrasts(inside: Tensor, around: Tensor, config: DataConfig, random
     return _contrasts(first, second, 4)
 
 
-def _ball(mask: Tensor, radius_mm: tuple[float, float], voxel_mm: float, size: Tensor, place: Tensor) -> Tensor:
+def _ball(
+    mask: Tensor, radius_mm: tuple[float, float], voxel_mm: float, size: Tensor, place: Tensor
+) -> Tensor:
     """The voxels in a ball about a random voxel of ``mask``."""
     low, high = radius_mm
     reach = (low + (high - low) * size) / voxel_mm
     counted = mask.flatten(1).int().cumsum(1)
     wanted = (place * counted[:, -1]).int().clamp_max(counted[:, -1] - 1) + 1
-    at = torch.searchsorted(counted, wanted[:, None].clamp_min(1))[:, 0].clamp_max(counted.shape[1] - 1)
+    at = torch.searchsorted(counted, wanted[:, None].clamp_min(1))[:, 0].clamp_max(
+        counted.shape[1] - 1
+    )
     nz, ny, nx = mask.shape[1:]
     z, y, x = (
         (torch.arange(n, device=mask.device) - c[:, None]).square()

@@ -22,7 +22,8 @@ __all__ = ["Logs", "Table"]
 
 logger = logging.getLogger(__name__)
 
-DARKEST_HU, BRIGHTEST_HU = -150.0, 450.0
+DARKEST_HU = -150.0
+BRIGHTEST_HU = 450.0
 SMALLEST_PICTURE = 256
 """Pictures are enlarged by a whole factor until their shorter side has this many pixels."""
 
@@ -34,7 +35,8 @@ class Table:
 
     Args:
         path: file; an existing one is continued.
-        after: rows beyond this step, and a last row that was cut short, are dropped from an existing file.
+        after: rows beyond this step, and a last row that was cut short, are dropped from an
+            existing file.
     """
 
     def __init__(self, path: Path, after: int = 0) -> None:
@@ -46,7 +48,11 @@ class Table:
             text = path.read_text(encoding="utf-8")
             # Without its line end the last row may be cut short anywhere, also within a number.
             rows = list(csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1])))
-            self._rows = [r for r in rows if None not in r.values() and r["step"].isdigit() and int(r["step"]) <= after]
+            self._rows = [
+                r
+                for r in rows
+                if None not in r.values() and r["step"].isdigit() and int(r["step"]) <= after
+            ]
             if self._rows:
                 self.columns = list(self._rows[0])
                 self._rewrite()
@@ -97,8 +103,9 @@ def _number(value: float) -> str:
 class Logs:
     """Everything a run writes beside its checkpoints.
 
-    ``log.csv`` has a row per logged step, ``validation.csv`` one per validation, ``pictures/`` the sections of every
-    validation, ``tensorboard/`` the same figures as events, if tensorboard is installed.
+    ``log.csv`` has a row per logged step, ``validation.csv`` one per validation, ``pictures/`` the
+    sections of every validation, ``tensorboard/`` the same figures as events, if tensorboard is
+    installed.
 
     Args:
         folder: of the run, existing.
@@ -110,7 +117,13 @@ class Logs:
     """
 
     def __init__(
-        self, folder: Path, step: int, steps: int, progress: bool = True, tensorboard: bool = True, validated: int = 0
+        self,
+        folder: Path,
+        step: int,
+        steps: int,
+        progress: bool = True,
+        tensorboard: bool = True,
+        validated: int = 0,
     ) -> None:
         self.folder = folder
         self.table = Table(folder / "log.csv", step)
@@ -147,7 +160,11 @@ class Logs:
         self._bar.update(step - self._bar.n)
 
     def validated(
-        self, step: int, score: float, figures: Mapping[str, float], pictures: Mapping[str, NDArray[Any]]
+        self,
+        step: int,
+        score: float,
+        figures: Mapping[str, float],
+        pictures: Mapping[str, NDArray[Any]],
     ) -> None:
         """A validation is done."""
         values = {"score": score, **figures}

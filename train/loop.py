@@ -1,11 +1,13 @@
 """The training loop: deterministic, resumable bit for bit, on one or several processes.
 
-What happens in a step depends on the configuration and the step's number only: the data are a pure function of
-``(seed, step, index)``, the learning rate and the averaging of the weights follow the count of updates, and torch's
-global generator is seeded anew before each step and each validation. So a run that is killed and resumed gives the same
-bits as one that was not, on the same machine with the same numbers of threads and processes.
+What happens in a step depends on the configuration and the step's number only: the data are a pure
+function of ``(seed, step, index)``, the learning rate and the averaging of the weights follow the
+count of updates, and torch's global generator is seeded anew before each step and each validation.
+So a run that is killed and resumed gives the same bits as one that was not, on the same machine
+with the same numbers of threads and processes.
 
-Several processes share the scenes of a batch (:mod:`train.processes`). Process 0 alone validates and writes.
+Several processes share the scenes of a batch (:mod:`train.processes`). Process 0 alone validates
+and writes.
 """
 
 from __future__ import annotations
@@ -42,7 +44,8 @@ def train(
     progress: bool = False,
     tensorboard: bool = True,
 ) -> tuple[State, int]:
-    """Train, from the start or from the checkpoint in ``out``, until the last step or a SIGTERM or SIGINT.
+    """Train, from the start or from the checkpoint in ``out``, until the last step or a SIGTERM or
+    SIGINT.
 
     Args:
         config: of the run; a resumed one must have the same, but for ``checkpoint_seconds``.
@@ -50,27 +53,31 @@ def train(
         data: source of the scenes; ``batch`` must be a pure function of its arguments.
         held_out: scenes of the validation.
         objective: what is minimised, and what the weights are chosen by.
-        out: folder of the run, made if missing. It gets ``checkpoint*.safetensors``, ``config.yaml``, ``log.csv``,
-            ``validation.csv``, ``pictures``, ``tensorboard``, and the best weights with their card as
-            ``weights.safetensors``, ``card.json``, ``training.md``.
+        out: folder of the run, made if missing. It gets ``checkpoint*.safetensors``,
+            ``config.yaml``, ``log.csv``, ``validation.csv``, ``pictures``, ``tensorboard``, and the
+            best weights with their card as ``weights.safetensors``, ``card.json``, ``training.md``.
         resume: continue from the checkpoint.
         command: command line, for the card.
         progress: show a progress line.
         tensorboard: write events.
 
     Returns:
-        Where the run is at the end, and the number of the signal that ended it: 0 if there was none, or if it came to
+        Where the run is at the end, and the number of the signal that ended it: 0 if there was
+            none, or if it came to
         another process.
 
     Raises:
         FileExistsError: ``out`` is not empty, and ``resume`` is false.
         TensorFileError: no whole checkpoint to resume from, or it belongs to another model.
-        ValueError: the configuration is not the checkpoint's, or there are more processes than scenes in a batch.
+        ValueError: the configuration is not the checkpoint's, or there are more processes than
+            scenes in a batch.
         DivergedError: loss or gradient not finite for 20 steps in a row.
     """
     group = Group()
     if group.size > config.batch:
-        raise ValueError(f"batch ({config.batch}) must be at least the number of processes ({group.size})")
+        raise ValueError(
+            f"batch ({config.batch}) must be at least the number of processes ({group.size})"
+        )
     run = Run(config, model, group, Path(out))
     run.begin(resume, command)
     state = run.state
@@ -97,7 +104,9 @@ def _logs(run: Run, progress: bool, tensorboard: bool) -> Iterator[None]:
     if not run.writes:
         yield
         return
-    run.logs = Logs(run.out, run.state.step, run.config.steps, progress, tensorboard, run.state.validated)
+    run.logs = Logs(
+        run.out, run.state.step, run.config.steps, progress, tensorboard, run.state.validated
+    )
     try:
         for text in run.notes:
             run.logs.message(text)
@@ -108,11 +117,12 @@ def _logs(run: Run, progress: bool, tensorboard: bool) -> Iterator[None]:
 
 @contextmanager
 def _signals(alone: bool) -> Iterator[list[int]]:
-    """SIGTERM and SIGINT are collected in a list instead of ending the process; a second SIGINT ends it.
+    """SIGTERM and SIGINT are collected in a list instead of ending the process; a second SIGINT
+    ends it.
 
     Args:
-        alone: one process. Several get the signal from the terminal and once more from their launcher: then a second
-            one means nothing.
+        alone: one process. Several get the signal from the terminal and once more from their
+            launcher: then a second one means nothing.
     """
     caught: list[int] = []
     if threading.current_thread() is not threading.main_thread():

@@ -1,18 +1,23 @@
 """What the training minimises, and how checkpoints are chosen.
 
-A plain squared error teaches a network to shrink what it is unsure of: the error falls, the contrast with it. Three
-terms, all from two independent noise draws of each scene with errors e₁, e₂ in noise units:
+A plain squared error teaches a network to shrink what it is unsure of: the error falls, the
+contrast with it. Three terms, all from two independent noise draws of each scene with errors e₁, e₂
+in noise units:
 
-* ``data``: eᵀH e per voxel, the error as the scanner would see it, which is the noise-whitened squared error;
-* ``white``: ‖e‖² per voxel, for the frequencies that the scanner does not see; more on both sides of edges, where blur
-  and undershoot are, and in bodies, which are small beside what surrounds them; more again deep in wide bodies, where
-  no contrast can be lost and noise alone is left;
-* ``noise_free``: both of the same scene without noise, where all that is left is blur and overshoot beside edges;
-* ``contrast``: the errors d of ROI contrasts, small ones and that of a whole core, (d₁² + d₂²) / 2 + κ d₁ d₂. The
-  product of two draws is an unbiased estimate of the squared bias, so κ trades variance against bias.
+* ``data``: eᵀH e per voxel, the error as the scanner would see it, which is the noise-whitened
+  squared error;
+* ``white``: ‖e‖² per voxel, for the frequencies that the scanner does not see; more on both sides
+  of edges, where blur and undershoot are, and in bodies, which are small beside what surrounds
+  them; more again deep in wide bodies, where no contrast can be lost and noise alone is left;
+* ``noise_free``: both of the same scene without noise, where all that is left is blur and overshoot
+  beside edges;
+* ``contrast``: the errors d of ROI contrasts, small ones and that of a whole core, (d₁² + d₂²) / 2
+  + κ d₁ d₂. The product of two draws is an unbiased estimate of the squared bias, so κ trades
+  variance against bias.
 
-Every scene has a random fidelity, so that one network serves all of them: from the least error, which shrinks what it
-is unsure of, at fidelity 0, to the least bias at fidelity 1. The contrast's weight and κ grow with it.
+Every scene has a random fidelity, so that one network serves all of them: from the least error,
+which shrinks what it is unsure of, at fidelity 0, to the least bias at fidelity 1. The contrast's
+weight and κ grow with it.
 """
 
 from __future__ import annotations
@@ -35,8 +40,10 @@ from train.data import Batch, Data
 
 __all__ = ["Loss", "Objective", "Validation"]
 
-_TAME_ERROR, _TAME_CONTRAST = 0.02, 2.0
-"""A few scenes (calcifications at high dose) would drown all others: losses beyond count less than their size."""
+_TAME_ERROR = 0.02
+_TAME_CONTRAST = 2.0
+"""A few scenes (calcifications at high dose) would drown all others: losses beyond count less
+than their size."""
 _NOISE_FREE_SHARE = 0.5
 """Share of the scenes that are seen without noise too; there that counts so many times more."""
 _LEAST_CONTRAST_HU = 10.0
@@ -67,9 +74,10 @@ class Validation:
 
     Args:
         score: higher is better; selects the checkpoint.
-        figures: at low and at high exposures, ``error`` (root mean square in bodies over that of the bilateral filter
-            in the network's place), ``all`` (the same over whole volumes), ``slope`` of ROI contrasts against the true
-            ones, ``false_hu``, the mean size of contrasts where there is none.
+        figures: at low and at high exposures, ``error`` (root mean square in bodies over that of
+            the bilateral filter in the network's place), ``all`` (the same over whole volumes),
+            ``slope`` of ROI contrasts against the true ones, ``false_hu``, the mean size of
+            contrasts where there is none.
         pictures: axial images in HU above the background, truth, volume and filter side by side.
     """
 
@@ -103,7 +111,9 @@ class Objective:
         low, high = c.fidelities
         fidelity = low + (high - low) * batch.lots[:, 0]
 
-        def network(estimate: Tensor, towards: Tensor, condition: Tensor, smoothed: Tensor | None) -> Tensor:
+        def network(
+            estimate: Tensor, towards: Tensor, condition: Tensor, smoothed: Tensor | None
+        ) -> Tensor:
             seen = [None if v is None else batch.turned(v) for v in (estimate, towards, smoothed)]
             prior: Any = model.network
             made: Tensor = prior(seen[0], seen[1], condition, seen[2])
@@ -125,7 +135,8 @@ class Objective:
         white = (error.square() * (1.0 + places[scene])).mean(dim=(1, 2, 3))
         image = c.data * (data + c.white * white) / (1.0 + data.detach() / _TAME_ERROR)
         noisy, error = image[: 2 * n], error[: 2 * n]
-        # The noise of an ROI mean falls with its size, but less than as 1/√voxels: neighbours are correlated.
+        # The noise of an ROI mean falls with its size, but less than as 1/√voxels: neighbours are
+        # correlated.
         size = (20.0 / batch.voxels.clamp_min(4.0)).pow(0.25) * c.contrast_sd
         d = torch.einsum("dnzyx,nrzyx->dnr", error.unflatten(0, (2, n)), batch.contrast) / size
         variance, product = d.square().mean(0), d[0] * d[1]
@@ -150,7 +161,8 @@ class Objective:
 
     @torch.no_grad()
     def validate(self, model: nn.Module, held_out: Data) -> Validation:
-        """Figures of the whole method at the usual fidelity on scenes that no training draws, one noise draw of each.
+        """Figures of the whole method at the usual fidelity on scenes that no training draws, one
+        noise draw of each.
 
         Args:
             model: in evaluation mode.
@@ -163,10 +175,16 @@ class Objective:
             problem, views = batch.volumes(torch.arange(batch.size))
             scale = problem.scale_hu.reshape(-1, 1, 1, 1)
 
-            def volume(prior: Prior | None, problem: NormalisedProblem = problem, views: Views = views) -> Tensor:
+            def volume(
+                prior: Prior | None, problem: NormalisedProblem = problem, views: Views = views
+            ) -> Tensor:
                 # The filter has the views that are kept: those of one step.
                 made: Tensor = model(
-                    problem, DEFAULT_FIDELITY, steps=None if prior is None else 1, views=views, prior=prior
+                    problem,
+                    DEFAULT_FIDELITY,
+                    steps=None if prior is None else 1,
+                    views=views,
+                    prior=prior,
                 )
                 return made
 
@@ -179,9 +197,13 @@ class Objective:
                 errors = [(v[i] - batch.truth[i]).square() for v in (made, simple)]
                 row = {"scale": float(problem.scale_hu[i])}
                 for name, error in zip(("made", "simple"), errors, strict=True):
-                    row[f"{name}_inside"] = float(error[inside].mean()) if inside.any() else math.nan
+                    row[f"{name}_inside"] = (
+                        float(error[inside].mean()) if inside.any() else math.nan
+                    )
                     row[f"{name}_all"] = float(error.mean())
-                row["true"], row["read"] = (float((v[i] * weights).sum()) for v in (batch.truth, made))
+                row["true"], row["read"] = (
+                    float((v[i] * weights).sum()) for v in (batch.truth, made)
+                )
                 row["has"] = float(weights.any())
                 rows.append(row)
             if step < 4:
@@ -200,9 +222,13 @@ class Objective:
                 figures[f"{label}_{name}"] = float(np.exp(0.5 * np.nanmean(ratio)))
             has, real = of["has"] > 0, np.abs(of["true"]) > _LEAST_CONTRAST_HU
             both = has & real
-            slope = (of["true"] * of["read"])[both].sum() / max(np.square(of["true"][both]).sum(), 1e-9)
+            slope = (of["true"] * of["read"])[both].sum() / max(
+                np.square(of["true"][both]).sum(), 1e-9
+            )
             figures[f"slope_{name}"] = float(slope)
-            figures[f"false_hu_{name}"] = float(np.abs(of["read"])[has & ~real].mean()) if (has & ~real).any() else 0.0
+            figures[f"false_hu_{name}"] = (
+                float(np.abs(of["read"])[has & ~real].mean()) if (has & ~real).any() else 0.0
+            )
             score -= math.log(figures[f"error_{name}"]) + 0.5 * math.log(figures[f"all_{name}"])
         return Validation(score, figures, pictures)
 

@@ -1,7 +1,7 @@
 """The processes of a run, and the gradient of a batch that they share.
 
-Each process takes every n-th scene of the batch; gradients are summed and divided by the whole batch. All then take the
-same step, so the weights stay equal without being sent.
+Each process takes every n-th scene of the batch; gradients are summed and divided by the whole
+batch. All then take the same step, so the weights stay equal without being sent.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from train.data import Data, seed_of
 from train.objective import Objective
 
 if distributed.is_available():
-    import torch.distributed.nn  # now: it keeps the group that exists at its import, whose threads then abort the exit
+    # now: it keeps the group that exists at its import, whose threads then abort the exit
+    import torch.distributed.nn
 
 __all__ = ["Group", "gradient"]
 
@@ -47,12 +48,18 @@ class Group:
 
 
 def gradient(
-    config: TrainConfig, model: nn.Module, data: Data, objective: Objective, step: int, group: Group, stop: bool = False
+    config: TrainConfig,
+    model: nn.Module,
+    data: Data,
+    objective: Objective,
+    step: int,
+    group: Group,
+    stop: bool = False,
 ) -> tuple[dict[str, float], bool]:
     """Put the gradient of the mean loss over the batch of a step into the parameters of ``model``.
 
-    It is equal in all processes, and equal for any number of processes but for the rounding of the sums. Where the loss
-    is not finite, neither is the gradient.
+    It is equal in all processes, and equal for any number of processes but for the rounding of the
+    sums. Where the loss is not finite, neither is the gradient.
 
     Args:
         step: counted from 0.
@@ -60,22 +67,30 @@ def gradient(
         stop: this process wants to stop.
 
     Returns:
-        The loss and its parts as means over the batch; whether any process wants to stop. Equal in all processes.
+        The loss and its parts as means over the batch; whether any process wants to stop. Equal in
+        all processes.
     """
     torch.manual_seed(seed_of("step", config.seed, step))
     model.zero_grad()
     parameters = list(model.parameters())
     total, parts = parameters[0].new_zeros(1), Counter[str]()
     loss = objective(
-        model, data.batch(step, config.batch, range(group.rank, config.batch, group.size)), step / config.steps
+        model,
+        data.batch(step, config.batch, range(group.rank, config.batch, group.size)),
+        step / config.steps,
     )
     loss.total.backward()
     total += loss.total.detach()
     parts.update(loss.parts)
     pieces = [(torch.zeros_like(p) if p.grad is None else p.grad).reshape(-1) for p in parameters]
-    # One message: the gradient, the loss (for whether it is finite), and the wish to stop, on which all must agree.
+    # One message: the gradient, the loss (for whether it is finite), and the wish to stop, on which
+    # all must agree.
     flat = group.sum(torch.cat([*pieces, total, total.new_tensor([float(stop)])]))
-    mean = flat[:-2] / config.batch if torch.isfinite(flat[-2]) else torch.full_like(flat[:-2], math.nan)
+    mean = (
+        flat[:-2] / config.batch
+        if torch.isfinite(flat[-2])
+        else torch.full_like(flat[:-2], math.nan)
+    )
     for p, piece in zip(parameters, mean.split([p.numel() for p in parameters]), strict=True):
         p.grad = piece.view_as(p)
     values: dict[str, float] = {}

@@ -1,7 +1,9 @@
-"""A run in one process: its state, and what is done with it: resume, step, validate, save, export with a record.
+"""A run in one process: its state, and what is done with it: resume, step, validate, save, export
+with a record.
 
-Adam, the average of the weights and the learning rate count updates: steps less those that were skipped. The learning
-rate is a closed form in that number, the other two keep all they know in tensors, so a checkpoint restores their bits.
+Adam, the average of the weights and the learning rate count updates: steps less those that were
+skipped. The learning rate is a closed form in that number, the other two keep all they know in
+tensors, so a checkpoint restores their bits.
 """
 
 from __future__ import annotations
@@ -41,7 +43,8 @@ __all__ = ["DivergedError", "Run", "State", "export", "finite", "rate_factor"]
 PATIENCE = 20
 """Steps with a loss or gradient that is not finite, in a row, after which a run is given up."""
 FREE_TO_CHANGE = {"checkpoint_seconds"}
-"""Fields of the configuration that do not change the result, so that a resumed run may have others."""
+"""Fields of the configuration that do not change the result, so that a resumed run may have
+others."""
 
 
 class DivergedError(RuntimeError):
@@ -55,7 +58,8 @@ class State:
     Args:
         step: steps done.
         validated: step of the last validation.
-        skipped: steps left out since the loss or gradient was not finite; bad: those at the end in a row.
+        skipped: steps left out since the loss or gradient was not finite; bad: those at the end in
+            a row.
         seconds: wall time spent, over all sessions.
         best: ``score``, ``step``, ``seconds`` and ``figures`` of the best validation.
         sessions: command line and first step of each start.
@@ -73,7 +77,8 @@ class State:
 
 
 def rate_factor(config: TrainConfig, update: int) -> float:
-    """Share of the learning rate at an update, counted from 0: linear warm-up, constant, at last a cosine.
+    """Share of the learning rate at an update, counted from 0: linear warm-up, constant, at last a
+    cosine.
 
     It ends with ``final_fraction``.
     """
@@ -81,7 +86,9 @@ def rate_factor(config: TrainConfig, update: int) -> float:
         return (update + 1) / config.warmup
     first = max(config.decay_begins, config.warmup)
     phase = max(update - first, 0) / max(1, config.steps - first)
-    return config.final_fraction + (1 - config.final_fraction) * 0.5 * (1 + math.cos(math.pi * phase))
+    return config.final_fraction + (1 - config.final_fraction) * 0.5 * (
+        1 + math.cos(math.pi * phase)
+    )
 
 
 def _averaged(model: nn.Module, ema: float) -> AveragedModel:
@@ -120,7 +127,9 @@ class Run:
         self.average = _averaged(model, config.ema)
         self.best: dict[str, Tensor] = {}
         rate = config.learning_rate
-        self.adam = Adam([{"params": model.parameters(), "initial_lr": rate}], lr=rate, betas=(0.9, 0.99))
+        self.adam = Adam(
+            [{"params": model.parameters(), "initial_lr": rate}], lr=rate, betas=(0.9, 0.99)
+        )
         self.logs: Logs | None = None
         self.notes: list[str] = []
         self._begun = self._saved = time.monotonic()
@@ -132,23 +141,33 @@ class Run:
         Raises:
             FileExistsError, TensorFileError, ValueError: see :func:`train.loop.train`.
         """
-        machine = {"threads": torch.get_num_threads(), "processes": self.group.size, "torch": torch.__version__}
+        machine = {
+            "threads": torch.get_num_threads(),
+            "processes": self.group.size,
+            "torch": torch.__version__,
+        }
         state = self.state
         if resume:
             state = self.state = self._load()
             changed = [k for k, v in machine.items() if state.machine.get(k) != v]
             if changed:
                 was = ", ".join(f"{k} {state.machine.get(k)} → {machine[k]}" for k in changed)
-                self.notes.append(f"the result will differ in its last digits from an uninterrupted run: {was}")
+                self.notes.append(
+                    f"the result will differ in its last digits from an uninterrupted run: {was}"
+                )
         elif self.writes:
             self.out.mkdir(parents=True, exist_ok=True)
             if any(path.name != "views" for path in self.out.iterdir()):
-                raise FileExistsError(f"{self.out} is not empty: continue the run in it with --resume, or use another")
+                raise FileExistsError(
+                    f"{self.out} is not empty: continue the run in it with --resume, or use another"
+                )
         if self.writes:
             self.store.clean()
             (self.out / "config.yaml").write_text(self.config.to_yaml(), encoding="utf-8")
         done = state.step - state.skipped
-        self.rate = LambdaLR(self.adam, lambda update: rate_factor(self.config, update), last_epoch=done - 1)
+        self.rate = LambdaLR(
+            self.adam, lambda update: rate_factor(self.config, update), last_epoch=done - 1
+        )
         state.machine = machine
         state.sessions.append({"command": command, "first_step": state.step})
         self._before = state.seconds
@@ -160,11 +179,14 @@ class Run:
         before = TrainConfig.from_yaml(metadata["config"])
         other = set(differences(self.config.as_dict(), before.as_dict())) - FREE_TO_CHANGE
         alike = self.config.unroll == 1 or self.config.single == 0.0
-        if alike and metadata["state"]["step"] <= min(self.config.decay_begins, before.decay_begins):
+        if alike and metadata["state"]["step"] <= min(
+            self.config.decay_begins, before.decay_begins
+        ):
             other -= {"steps", "decay", "final_fraction"}  # nothing has depended on them yet
         if other:
             raise ValueError(
-                f"the run in {self.out} has another configuration ({', '.join(sorted(other))}): resume it unchanged, "
+                f"the run in {self.out} has another configuration ({', '.join(sorted(other))}): "
+                "resume it unchanged, "
                 "or start a new run from its weights"
             )
         moments: dict[int, dict[str, Tensor]] = {}
@@ -176,12 +198,15 @@ class Run:
             self.average.load_state_dict(_part(tensors, "average"))
             self.adam.load_state_dict({**self.adam.state_dict(), "state": moments})
         except (RuntimeError, KeyError, ValueError) as error:
-            raise TensorFileError(f"the checkpoint in {self.out} belongs to another model: {error}") from error
+            raise TensorFileError(
+                f"the checkpoint in {self.out} belongs to another model: {error}"
+            ) from error
         self.best = _part(tensors, "best")
         return State(**metadata["state"])
 
     def step(self, values: Mapping[str, float]) -> None:
-        """One optimisation step with the gradient that :func:`train.processes.gradient` left in the model.
+        """One optimisation step with the gradient that :func:`train.processes.gradient` left in the
+        model.
 
         Raises:
             DivergedError: too many steps in a row were skipped.
@@ -199,18 +224,29 @@ class Run:
             state.bad += 1
         state.step += 1
         self._tick()
-        row = {"seconds": state.seconds, "lr": rate, "grad_norm": norm, "skipped": state.skipped, **values}
+        row = {
+            "seconds": state.seconds,
+            "lr": rate,
+            "grad_norm": norm,
+            "skipped": state.skipped,
+            **values,
+        }
         if self.logs is not None:
-            self.logs.step(state.step, row, state.step % config.log_every == 0 or state.step == config.steps)
+            self.logs.step(
+                state.step, row, state.step % config.log_every == 0 or state.step == config.steps
+            )
         if state.bad >= PATIENCE:
             raise DivergedError(
-                f"the loss or its gradient was not finite in {PATIENCE} steps in a row, up to step {state.step}: "
-                f"the weights have not changed since step {state.step - state.bad}; try a smaller learning rate than "
+                f"the loss or its gradient was not finite in {PATIENCE} steps in a row, up to "
+                f"step {state.step}: "
+                f"the weights have not changed since step {state.step - state.bad}; try a smaller "
+                "learning rate than "
                 f"{config.learning_rate:g}"
             )
 
     def validate(self, held_out: Data, objective: Objective) -> None:
-        """Validate the averaged weights, keep them if they are the best, unless that has been done at this step."""
+        """Validate the averaged weights, keep them if they are the best, unless that has been
+        done at this step."""
         state = self.state
         if state.validated == state.step:
             return
@@ -228,7 +264,12 @@ class Run:
         self._tick()
         better = math.isfinite(score) and (state.best is None or score > state.best["score"])
         if better:
-            state.best = {"score": score, "step": state.step, "seconds": state.seconds, "figures": finite(figures)}
+            state.best = {
+                "score": score,
+                "step": state.step,
+                "seconds": state.seconds,
+                "figures": finite(figures),
+            }
             self.best = {k: v.clone() for k, v in self.average.module.state_dict().items()}
         if self.logs is not None:
             self.logs.validated(state.step, score, figures, result.pictures)
@@ -249,7 +290,9 @@ class Run:
         if self.logs is not None:
             self.logs.sync()
         self._tick()
-        adam = {f"{i}.{k}": v for i, s in self.adam.state_dict()["state"].items() for k, v in s.items()}
+        adam = {
+            f"{i}.{k}": v for i, s in self.adam.state_dict()["state"].items() for k, v in s.items()
+        }
         parts = {
             "model": self.model.state_dict(),
             "average": self.average.state_dict(),
@@ -300,8 +343,11 @@ def finite(value: Any) -> Any:
     return value
 
 
-def export(folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, state: Mapping[str, Any]) -> None:
-    """Write ``weights.safetensors`` (the package's network in float16), ``card.json`` and the same as ``training.md``.
+def export(
+    folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, state: Mapping[str, Any]
+) -> None:
+    """Write ``weights.safetensors`` (the package's network in float16), ``card.json`` and the same
+    as ``training.md``.
 
     Args:
         folder: existing.
@@ -310,9 +356,14 @@ def export(folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, sta
         state: fields of :class:`train.run.State` as of now; ``best`` describes the weights.
     """
     best = state["best"]
-    # Half the bytes, and 0.05 % of a weight: no volume changes by a tenth of a HU. Another network is kept as it is.
+    # Half the bytes, and 0.05 % of a weight: no volume changes by a tenth of a HU. Another network
+    # is kept as it is.
     foreign = "class" in config.network
-    halved = {} if foreign else {k: w.to(torch.float16) for k, w in weights.items() if k.startswith("network.")}
+    halved = (
+        {}
+        if foreign
+        else {k: w.to(torch.float16) for k, w in weights.items() if k.startswith("network.")}
+    )
     stored = {**weights, **halved}
     versions = {**environment(), "safetensors": safetensors.__version__}
     system = f"{platform.system()} {versions.pop('machine')}"
@@ -343,8 +394,17 @@ def export(folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, sta
         **({"voxel_mm": config.data.voxel_mm} if foreign else {}),
     }
     write_tensors(folder / "weights.safetensors", WEIGHTS_FORMAT, stored, header)
-    record = filled(Path(__file__).parent / "templates" / "training.md.j2", {**card, "yaml": config.to_yaml()}) + "\n"
-    texts = {"card.json": json.dumps(card, indent=2, ensure_ascii=False) + "\n", "training.md": record}
+    record = (
+        filled(
+            Path(__file__).parent / "templates" / "training.md.j2",
+            {**card, "yaml": config.to_yaml()},
+        )
+        + "\n"
+    )
+    texts = {
+        "card.json": json.dumps(card, indent=2, ensure_ascii=False) + "\n",
+        "training.md": record,
+    }
     for name, text in texts.items():
         with atomic_write(folder / name) as part:
             part.write_text(text, encoding="utf-8")

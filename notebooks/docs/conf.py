@@ -1,8 +1,9 @@
 """The site: ``sphinx-build -W -n -b html notebooks/docs out/site``.
 
-The gallery runs, for its pictures; not with ``-D sphinx_gallery_conf.filename_pattern=none``, which is minutes faster.
-Nothing is downloaded: formulas become MathML (docutils), which browsers draw themselves. The pages of the API and of
-the command line are written from the package each time, into ``reference/generated``.
+The gallery runs, for its pictures; not with ``-D sphinx_gallery_conf.filename_pattern=none``, which
+is minutes faster. Nothing is downloaded: formulas become MathML (docutils), which browsers draw
+themselves. The pages of the API and of the command line are written from the package each time,
+into ``reference/generated``.
 """
 
 import importlib
@@ -27,9 +28,14 @@ from pages import canonical, write_api, write_cli, write_notebooks, write_result
 
 project, author = "torchpcct", "the authors of torchpcct"
 extensions = [
-    "sphinx.ext.autodoc", "sphinx.ext.napoleon", "myst_parser", "sphinx_design", "sphinx_copybutton",
-    "sphinxcontrib.bibtex", "sphinx_gallery.gen_gallery",
-]  # fmt: skip
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "myst_parser",
+    "sphinx_design",
+    "sphinx_copybutton",
+    "sphinxcontrib.bibtex",
+    "sphinx_gallery.gen_gallery",
+]
 html_theme = "pydata_sphinx_theme"
 html_title = "torchpcct"
 html_static_path = ["_static"]
@@ -37,9 +43,14 @@ html_css_files = ["site.css"]
 html_show_sourcelink = False
 html_copy_source = False
 html_theme_options = {
-    "navbar_end": ["theme-switcher"], "collapse_navigation": True, "show_prev_next": False,
-    "header_links_before_dropdown": 7, "secondary_sidebar_items": ["page-toc"], "footer_start": [], "footer_end": [],
-}  # fmt: skip
+    "navbar_end": ["theme-switcher"],
+    "collapse_navigation": True,
+    "show_prev_next": False,
+    "header_links_before_dropdown": 7,
+    "secondary_sidebar_items": ["page-toc"],
+    "footer_start": [],
+    "footer_end": [],
+}
 html_sidebars = {"index": [], "results": [], "limits": [], "glossary": []}
 html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath", "deflist", "colon_fence"]
@@ -49,11 +60,18 @@ exclude_patterns = ["gallery/*.ipynb", "gallery/*.py", "gallery/*.zip"]
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True
 
-nitpick_ignore_regex = [  # what other packages and private bases are; no inventory of theirs is downloaded
-    ("py:.*", r"(numpy|torch|jinja2|collections|concurrent|typing|matplotlib|argparse|pathlib|enum|np|nn)\..*"),
+# what other packages and private bases are; no inventory of theirs is downloaded
+nitpick_ignore_regex = [
+    (
+        "py:.*",
+        r"(numpy|torch|jinja2|collections|concurrent|typing|matplotlib|argparse|pathlib|enum|np|nn)\..*",
+    ),
     ("py:.*", r"(.*\.)?_\w+"),
-    ("py:(class|exc)", r"(optional|Module|Exception|Tensor|ndarray|\w+Error|(nbclient|scipy|pydicom)\..*)"),
-]  # fmt: skip
+    (
+        "py:(class|exc)",
+        r"(optional|Module|Exception|Tensor|ndarray|\w+Error|(nbclient|scipy|pydicom)\..*)",
+    ),
+]
 autodoc_typehints = "none"  # the docstrings say shapes, units and kinds, in words
 autodoc_class_signature = "mixed"
 autodoc_member_order = "bysource"
@@ -61,28 +79,42 @@ napoleon_use_rtype = False
 napoleon_custom_sections = [("Attributes", "params_style")]
 
 sphinx_gallery_conf = {
-    "examples_dirs": "../gallery", "gallery_dirs": "gallery", "filename_pattern": r"\d\d_", "plot_gallery": True,
-    "download_all_examples": False, "remove_config_comments": True, "show_memory": False, "copyfile_regex": r"$^",
-    "within_subsection_order": "FileNameSortKey", "write_computation_times": False, "image_scrapers": ("matplotlib",),
-    "reset_modules": ("matplotlib",), "notebook_images": False, "show_signature": False,
-}  # fmt: skip
+    "examples_dirs": "../gallery",
+    "gallery_dirs": "gallery",
+    "filename_pattern": r"\d\d_",
+    "plot_gallery": True,
+    "download_all_examples": False,
+    "remove_config_comments": True,
+    "show_memory": False,
+    "copyfile_regex": r"$^",
+    "within_subsection_order": "FileNameSortKey",
+    "write_computation_times": False,
+    "image_scrapers": ("matplotlib",),
+    "reset_modules": ("matplotlib",),
+    "notebook_images": False,
+    "show_signature": False,
+}
 
 
-# --- formulas -----------------------------------------------------------------------------------------------------
+# --- formulas -------------------------------------------------------------------------------------
 
 
 def _formula(self, node, block=False):
-    mathml = re.sub(r"^<math\b(?! xmlns)", "<math xmlns='http://www.w3.org/1998/Math/MathML'",
-                    str(tex2mathml(node.astext(), as_block=block)))  # fmt: skip
+    mathml = re.sub(
+        r"^<math\b(?! xmlns)",
+        "<math xmlns='http://www.w3.org/1998/Math/MathML'",
+        str(tex2mathml(node.astext(), as_block=block)),
+    )
     self.body.append(f'<div class="formula">{mathml}</div>' if block else mathml)
     raise nodes.SkipNode
 
 
-# --- references ---------------------------------------------------------------------------------------------------
+# --- references -----------------------------------------------------------------------------------
 
 
 def as_python_does(app, env, node, contnode):
-    """A name that a docstring uses is what Python finds there: in the module, or handed on by a package."""
+    """A name that a docstring uses is what Python finds there: in the module, or handed on by a
+    package."""
     if node.get("refdomain") != "py":
         return None
     target, inside = node["reftarget"], [node.get("py:module"), None]
@@ -103,7 +135,9 @@ def as_python_does(app, env, node, contnode):
             except (ImportError, AttributeError, LookupError, TypeError):
                 continue
             domain = env.domains["py"]
-            found = domain.resolve_xref(env, node["refdoc"], app.builder, "obj", full, node, contnode)
+            found = domain.resolve_xref(
+                env, node["refdoc"], app.builder, "obj", full, node, contnode
+            )
             if found is not None:
                 return found
     return None
@@ -111,13 +145,16 @@ def as_python_does(app, env, node, contnode):
 
 def setup(app):
     """Called by Sphinx."""
-    # Napoleon takes "Shape of one sinogram: …" of a property for a type and a text; what is returned, likewise.
+    # Napoleon takes "Shape of one sinogram: …" of a property for a type and a text; what is
+    # returned, likewise.
     GoogleDocstring._consume_returns_section = lambda self, preprocess_types=False: [
         ("", "", self._dedent(self._consume_to_next_section()))
     ]
     GoogleDocstring._consume_inline_attribute = lambda self: ("", self._consume_to_end())
     app.connect("missing-reference", as_python_does)
-    app.add_html_math_renderer("mathml", (_formula, None), (lambda self, node: _formula(self, node, True), None))
+    app.add_html_math_renderer(
+        "mathml", (_formula, None), (lambda self, node: _formula(self, node, True), None)
+    )
     write_api(HERE / "reference" / "generated")
     write_cli(HERE / "reference" / "generated" / "commands.md")
     write_results(HERE / "reports")

@@ -1,4 +1,5 @@
-"""The figure of the conventions page, drawn from what the package computes, so that the two cannot disagree."""
+"""The figure of the conventions page, drawn from what the package computes, so that the two
+cannot disagree."""
 
 from pathlib import Path
 
@@ -34,23 +35,57 @@ def draw(path: Path) -> None:
     ax.plot(*np.stack([source, foot])[:, :2].T, color="tab:orange", lw=0.8, ls="--")
     ax.plot(*columns[:, :2].T, "s", color="tab:blue", ms=5)
     ax.plot(*source[:2], "o", color="tab:orange", ms=9)
-    ax.text(*np.add(source[:2], (-3, 6)), "source, at sod · e_r(β)", color="tab:orange", ha="center")
+    ax.text(
+        *np.add(source[:2], (-3, 6)), "source, at sod · e_r(β)", color="tab:orange", ha="center"
+    )
     for j, name in ((0, "column 0"), (8, "column n − 1")):
-        ax.text(*np.add(columns[j, :2], (-4, -7 if j == 0 else 3)), name, color="tab:blue", ha="right", fontsize=9)
+        ax.text(
+            *np.add(columns[j, :2], (-4, -7 if j == 0 else 3)),
+            name,
+            color="tab:blue",
+            ha="right",
+            fontsize=9,
+        )
     arrow(ax, foot[:2], middle[:2], "", "tab:red")
-    ax.text(*np.add(middle[:2], (-6, 2)), "offset\n(column)", color="tab:red", fontsize=9, ha="right", va="center")
+    ax.text(
+        *np.add(middle[:2], (-6, 2)),
+        "offset\n(column)",
+        color="tab:red",
+        fontsize=9,
+        ha="right",
+        va="center",
+    )
     start = columns[1, :2] - 10 * source[:2] / g.sod
     arrow(ax, start, start + 22 * u[:2] / 8, "", "tab:blue")
-    ax.text(*np.add(start, (-11, 0)), "columns grow\nalong e_t(β)", color="tab:blue", fontsize=9, ha="right")
+    ax.text(
+        *np.add(start, (-11, 0)),
+        "columns grow\nalong e_t(β)",
+        color="tab:blue",
+        fontsize=9,
+        ha="right",
+    )
     arrow(ax, (0, 0), (28, 0), "x", shift=(1, -5))
     arrow(ax, (0, 0), (0, 28), "y")
     arc = np.linspace(0, g.angles[0], 30)
     ax.plot(14 * np.cos(arc), 14 * np.sin(arc), color="black", lw=1)
     ax.text(15.5, 3.5, "β", fontsize=12)
-    ax.text(73, -66, "voxel centres (grey): index k of n stands\nat (k − (n − 1)/2) · spacing + center", ha="right",
-            va="bottom", color="0.35", fontsize=9)  # fmt: skip
-    ax.set(title="seen from +z: β grows counter-clockwise", xlabel="x, mm", ylabel="y, mm", aspect="equal",
-           xlim=(-75, 75), ylim=(-68, 68))  # fmt: skip
+    ax.text(
+        73,
+        -66,
+        "voxel centres (grey): index k of n stands\nat (k − (n − 1)/2) · spacing + center",
+        ha="right",
+        va="bottom",
+        color="0.35",
+        fontsize=9,
+    )
+    ax.set(
+        title="seen from +z: β grows counter-clockwise",
+        xlabel="x, mm",
+        ylabel="y, mm",
+        aspect="equal",
+        xlim=(-75, 75),
+        ylim=(-68, 68),
+    )
 
     rows = g.row_positions
     side.plot([0, g.sdd], [0, 0], color="tab:orange", ls="--", lw=0.8)
@@ -68,6 +103,11 @@ def draw(path: Path) -> None:
     for length, height, name in ((g.sod, -38, "sod"), (g.sdd, -46, "sdd")):
         side.annotate("", (length, height), (0, height), arrowprops={"arrowstyle": "<|-|>"})
         side.text(length / 2, height + 1.5, name, ha="center")
-    side.set(title="seen from the side: rows grow along +z", xlabel="distance from the source, mm", ylabel="z, mm",
-             xlim=(-6, 128), ylim=(-52, 40))  # fmt: skip
+    side.set(
+        title="seen from the side: rows grow along +z",
+        xlabel="distance from the source, mm",
+        ylabel="z, mm",
+        xlim=(-6, 128),
+        ylim=(-52, 40),
+    )
     figure.savefig(path, metadata={"Date": None})

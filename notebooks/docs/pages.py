@@ -1,4 +1,5 @@
-"""Pages that are written from the package itself: its public names, its commands, its committed results."""
+"""Pages that are written from the package itself: its public names, its commands, its committed
+results."""
 
 import argparse
 import ast
@@ -14,9 +15,11 @@ ROOT = HERE.parents[1]
 
 
 def public_modules():
-    """Modules without an underscore in their names, by package: ``{package: [(module, own, others), …]}``.
+    """Modules without an underscore in their names, by package: ``{package: [(module, own, others),
+    …]}``.
 
-    ``own`` are the names of ``__all__`` that the module defines; ``others`` those it hands on from elsewhere.
+    ``own`` are the names of ``__all__`` that the module defines; ``others`` those it hands on from
+    elsewhere.
     """
     packages = {}
     for top in ("torchpcct", "recon", "train"):
@@ -35,7 +38,11 @@ def public_modules():
                     public = ast.literal_eval(node.value)
                 own.update(names)
             if public or ast.get_docstring(tree):
-                entry = (module, [n for n in public if n in own], [n for n in public if n not in own])
+                entry = (
+                    module,
+                    [n for n in public if n in own],
+                    [n for n in public if n not in own],
+                )
                 package = module if path.name == "__init__.py" else module.rpartition(".")[0]
                 packages.setdefault(package, []).append(entry)
     return packages
@@ -51,7 +58,9 @@ def canonical(module, name):
         return home, value.__qualname__
     tree = ast.parse(Path(importlib.import_module(module).__file__).read_text(encoding="utf-8"))
     for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and any((a.asname or a.name) == name for a in node.names):
+        if isinstance(node, ast.ImportFrom) and any(
+            (a.asname or a.name) == name for a in node.names
+        ):
             return node.module, name
     raise LookupError(f"{module}.{name}: nobody defines it")
 
@@ -60,7 +69,9 @@ def write_api(folder):
     """A page a package: each module's text, its names, and those it hands on."""
     packages, bare = public_modules(), {}
     for module in (m for modules in packages.values() for m, *_ in modules):
-        body = ast.parse(Path(importlib.util.find_spec(module).origin).read_text(encoding="utf-8")).body
+        body = ast.parse(
+            Path(importlib.util.find_spec(module).origin).read_text(encoding="utf-8")
+        ).body
         after = zip(body, [*body[1:], None], strict=True)  # a constant's text stands below it
         bare[module] = {
             n.id
@@ -76,7 +87,11 @@ def write_api(folder):
                 lines += [module, "-" * len(module), ""]
             lines += [f".. automodule:: {module}"]
             told = [name for name in own if name not in bare[module]]
-            lines += [f"   :members: {', '.join(told)}", "   :undoc-members:", "   :show-inheritance:"] if told else []
+            lines += (
+                [f"   :members: {', '.join(told)}", "   :undoc-members:", "   :show-inheritance:"]
+                if told
+                else []
+            )
             lines += ["", *(_constant(module, name) for name in own if name in bare[module])]
             for name in others:
                 home, qualname = canonical(module, name)
@@ -91,7 +106,10 @@ def write_api(folder):
 def _constant(module, name):
     """Of a constant without a text autodoc would show the text of its type."""
     value = " ".join(repr(getattr(importlib.import_module(module), name)).split())
-    return f".. py:data:: {name}\n   :module: {module}\n   :value: {value if len(value) < 72 else value[:70] + ' …'}\n"
+    return (
+        f".. py:data:: {name}\n   :module: {module}\n   :value: "
+        f"{value if len(value) < 72 else value[:70] + ' …'}\n"
+    )
 
 
 def write_cli(path):
@@ -114,7 +132,8 @@ def _help(parser):
 
 
 def write_results(folder):
-    """The committed results as pages, each with its pictures; links lead to these pages, or are plain text."""
+    """The committed results as pages, each with its pictures; links lead to these pages, or are
+    plain text."""
     notebooks, names = HERE.parent, []
     for report in sorted(notebooks.glob("*/report.md")):
         names.append(name := report.parent.name)
@@ -122,13 +141,20 @@ def write_results(folder):
         shown = sorted(p.name for p in report.parent.glob("*.png") if f"({p.name})" not in text)
         pictures = [f"![{p}](../../{name}/{p})\n" for p in shown]
         text = re.sub(r"\]\((\w+\.png)\)", rf"](../../{name}/\1)", text)
-        _write(folder / f"{name}.md", _linked("\n".join([f"# {name}: {title[2:]}", *pictures, text]), ""))
+        _write(
+            folder / f"{name}.md",
+            _linked("\n".join([f"# {name}: {title[2:]}", *pictures, text]), ""),
+        )
     records = (ROOT / "tests" / "bench" / f"{name}.md" for name in ("projectors", "solvers"))
-    speed = re.sub(r"^#", "##", "\n".join(r.read_text(encoding="utf-8") for r in records), flags=re.MULTILINE)
+    speed = re.sub(
+        r"^#", "##", "\n".join(r.read_text(encoding="utf-8") for r in records), flags=re.MULTILINE
+    )
     speed = re.sub(r"\]\((\w+\.png)\)", r"](../../../tests/bench/\1)", speed)
     _write(folder / "speed.md", f"# Speed against error\n\n{speed}")
     names.append("speed")
-    toctree = "\n".join(["", "```{toctree}", ":hidden:", *(f"reports/{name}" for name in names), "```", ""])
+    toctree = "\n".join(
+        ["", "```{toctree}", ":hidden:", *(f"reports/{name}" for name in names), "```", ""]
+    )
     _write(
         folder.parent / "results.md",
         _linked((notebooks / "RESULTS.md").read_text(encoding="utf-8"), "reports/") + toctree,
@@ -149,9 +175,13 @@ def write_notebooks(folder):
         for number, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):
             source = "".join(cell["source"])
             if cell["cell_type"] == "markdown":
-                parts.append(_linked(re.sub(r"\]\((\w+)\.ipynb\)", r"](notebook_\1.md)", source), ""))
+                parts.append(
+                    _linked(re.sub(r"\]\((\w+)\.ipynb\)", r"](notebook_\1.md)", source), "")
+                )
                 continue
-            parts.append("```python\n" + re.sub(r"^%.*\n", "", source, flags=re.MULTILINE) + "\n```")
+            parts.append(
+                "```python\n" + re.sub(r"^%.*\n", "", source, flags=re.MULTILINE) + "\n```"
+            )
             for output in cell["outputs"]:
                 data = output.get("data", {})
                 if "image/png" in data:
@@ -160,7 +190,9 @@ def write_notebooks(folder):
                     picture.write_bytes(base64.b64decode(data["image/png"]))
                     parts.append(f"![what the cell above drew]({picture.name})")
                 elif "text/markdown" in data:
-                    parts.append(re.sub(r"^#", "###", "".join(data["text/markdown"]), flags=re.MULTILINE))
+                    parts.append(
+                        re.sub(r"^#", "###", "".join(data["text/markdown"]), flags=re.MULTILINE)
+                    )
         _write(folder / f"notebook_{path.stem}.md", "\n\n".join([*parts, ""]))
 
 

@@ -14,10 +14,15 @@ from torchpcct.scene.plaque import plaque_scene
 
 scene, plaque = plaque_scene(vessel_length=6.0)
 inset = VolumeGrid((37, 45, 45), 0.2, plaque.position[::-1])
-scan = acquire(scene, presets.pcct(views=492, rows=32), exposure_s=2.0, seed=0, region=inset, duty=1 / 4)
-reading = read_plaque(TissueData.of_scan(scan, InsetProblem(scan, inset)))  # blind; or a point that a reader gives
+scan = acquire(
+    scene, presets.pcct(views=492, rows=32), exposure_s=2.0, seed=0, region=inset, duty=1 / 4
+)
+# blind; or a point that a reader gives
+reading = read_plaque(TissueData.of_scan(scan, InsetProblem(scan, inset)))
 fig, axes = plt.subplots(1, 2, figsize=(7.5, 3.4), layout="constrained")
-shown = axes[0].imshow(reading.image[18], cmap="gray", vmin=-150, vmax=450, extent=(-4.5, 4.5) * 2, origin="lower")
+shown = axes[0].imshow(
+    reading.image[18], cmap="gray", vmin=-150, vmax=450, extent=(-4.5, 4.5) * 2, origin="lower"
+)
 fig.colorbar(shown, ax=axes[0], label="HU, fitted tissues", shrink=0.8)
 core = reading.regions["core"][18]
 shown = axes[1].imshow(core, cmap="viridis", vmin=0, vmax=1, extent=(-4.5, 4.5) * 2, origin="lower")

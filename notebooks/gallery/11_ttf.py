@@ -16,7 +16,8 @@ from torchpcct.scene import Body, EllipticCylinder, Scene
 water = Body("water", EllipticCylinder(100.0), "water")
 rod = Body("rod", EllipticCylinder(4.0, position=(0.0, 40.0, 0.0)), "fibrous_tissue", "water")
 grid = VolumeGrid((1, 80, 80), 0.15, (0.0, 40.0, 0.0))
-scan = acquire(Scene([water, rod]), presets.pcct(views=492, rows=1), region=grid, duty=1 / 4)  # without noise
+# without noise
+scan = acquire(Scene([water, rod]), presets.pcct(views=492, rows=1), region=grid, duty=1 / 4)
 y, x = np.meshgrid(*grid.axes[1:], indexing="ij")
 distance = np.hypot(y - 40.0, x) - 4.0  # of every voxel from the rod's edge, mm
 fig, axes = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")

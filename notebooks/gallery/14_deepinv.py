@@ -22,7 +22,14 @@ else:
     volume = physics.A_dagger(data, max_iter=15)[0, 0]  # deepinv's own least squares
     error = float((volume - truth).square().mean().sqrt()) / 0.02 * 1000
     plt.figure(figsize=(4.6, 3.6), layout="constrained")
-    plt.imshow(volume * 50000 - 1000, cmap="gray", extent=(-64, 64) * 2, origin="lower", vmin=-1000, vmax=800)
+    plt.imshow(
+        volume * 50000 - 1000,
+        cmap="gray",
+        extent=(-64, 64) * 2,
+        origin="lower",
+        vmin=-1000,
+        vmax=800,
+    )
     plt.colorbar(label="HU")
     plt.gca().set(xlabel="x, mm", ylabel="y, mm", title="least squares by deepinv")
     print(f"deepinv's least squares, 60 views: error {error:.0f} HU (root mean square)")

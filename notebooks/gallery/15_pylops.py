@@ -23,10 +23,19 @@ else:
     P = A.as_pylops(np.float64)
     data = P @ truth.ravel() + 0.02 * np.random.default_rng(0).standard_normal(P.shape[0])
     smooth = Laplacian(A.domain_shape)  # bends are penalised
-    volume = regularized_inversion(P, data, [smooth], epsRs=[20.0], iter_lim=60)[0].reshape(A.domain_shape)
+    volume = regularized_inversion(P, data, [smooth], epsRs=[20.0], iter_lim=60)[0].reshape(
+        A.domain_shape
+    )
     error = float(np.sqrt(np.mean((volume - truth) ** 2))) / 0.02 * 1000
     plt.figure(figsize=(4.6, 3.6), layout="constrained")
-    plt.imshow(volume * 50000 - 1000, cmap="gray", extent=(-64, 64) * 2, origin="lower", vmin=-1000, vmax=800)
+    plt.imshow(
+        volume * 50000 - 1000,
+        cmap="gray",
+        extent=(-64, 64) * 2,
+        origin="lower",
+        vmin=-1000,
+        vmax=800,
+    )
     plt.colorbar(label="HU")
     plt.gca().set(xlabel="x, mm", ylabel="y, mm", title="regularised inversion by PyLops")
     print(f"PyLops, 60 views: error {error:.0f} HU (root mean square)")

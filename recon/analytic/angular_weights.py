@@ -1,8 +1,9 @@
-"""Angular weights of filtered backprojection: view spacing and redundancy (full circle, short scan, over-scan).
+"""Angular weights of filtered backprojection: view spacing and redundancy (full circle, short scan,
+over-scan).
 
-The weight of a reading is (angle its view stands for) × (its share among the readings of the same line). The lines of a
-divergent beam are measured twice in a full circle, at (β, γ) and at (β + π − 2γ, −γ) with this package's signs, so the
-shares of such a pair add up to 1.
+The weight of a reading is (angle its view stands for) × (its share among the readings of the same
+line). The lines of a divergent beam are measured twice in a full circle, at (β, γ) and at (β + π −
+2γ, −γ) with this package's signs, so the shares of such a pair add up to 1.
 """
 
 from __future__ import annotations
@@ -23,28 +24,32 @@ _LOG = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
 
-#: A parallel-beam scan may lack this angle in rad before it is refused; below it the neighbours fill in.
+# : A parallel-beam scan may lack this angle in rad before it is refused; below it the neighbours
+# fill in.
 PARALLEL_GAP_RAD = math.radians(5.0)
-#: Views that lack inside of the covered arc: neighbours stand for them up to this angle in rad, with a warning.
+# : Views that lack inside of the covered arc: neighbours stand for them up to this angle in rad,
+# with a warning.
 INNER_GAP_RAD = math.radians(5.0)
-#: A short scan may lack this angle in rad, or one step if that is less, of half a turn and the fan: lines at the fan's
-#: edge are not measured then.
+# : A short scan may lack this angle in rad, or one step if that is less, of half a turn and the
+# fan: lines at the fan's : edge are not measured then.
 SHORT_RAD = math.radians(2.0)
-#: The largest angle in rad that one view may stand for: five views a turn pass, as a test of operators, not of images.
+# : The largest angle in rad that one view may stand for: five views a turn pass, as a test of
+# operators, not of images.
 WIDEST_STEP_RAD = math.radians(75.0)
 
 
 @checked
 def check_gaps(angles: Floats, period: float = 2.0 * math.pi) -> None:
-    """Refuse views that are too few, or that lack inside of the arc they cover; log a warning where a few lack.
+    """Refuse views that are too few, or that lack inside of the arc they cover; log a warning where
+    a few lack.
 
     Args:
         angles: ``(views,)`` rad, any order.
         period: see :func:`torchpcct.angles.view_steps`.
 
     Raises:
-        ValueError: fewer than two distinct views, steps wider than 75°, or an inner gap of more than 5° and three
-            median steps.
+        ValueError: fewer than two distinct views, steps wider than 75°, or an inner gap of more
+            than 5° and three median steps.
     """
     ordered = np.sort(np.mod(angles, period))
     gaps = np.append(np.diff(ordered), ordered[0] + period - ordered[-1])
@@ -55,17 +60,22 @@ def check_gaps(angles: Floats, period: float = 2.0 * math.pi) -> None:
     inner = widest[1] if widest.size > 1 and widest[0] > OPEN_GAP_STEPS * usual else widest[0]
     if max(usual, min(inner, period)) > WIDEST_STEP_RAD + 1e-9 and inner <= OPEN_GAP_STEPS * usual:
         raise ValueError(
-            f"{gaps.size} distinct view{'s' * (gaps.size > 1)} in steps of up to {math.degrees(inner):.0f}° are too "
-            f"few for filtered backprojection (at most {math.degrees(WIDEST_STEP_RAD):.0f}°): add views, or "
+            f"{gaps.size} distinct view{'s' * (gaps.size > 1)} in steps of up to "
+            f"{math.degrees(inner):.0f}° are too "
+            f"few for filtered backprojection (at most {math.degrees(WIDEST_STEP_RAD):.0f}°): add "
+            "views, or "
             'reconstruct by "pwls" or "mbir"'
         )
     if inner > OPEN_GAP_STEPS * usual:
         lacking = (
-            f"views lack inside of the scan: besides its end a gap of {math.degrees(inner):.2f}° where the usual step "
+            f"views lack inside of the scan: besides its end a gap of {math.degrees(inner):.2f}° "
+            "where the usual step "
             f"is {math.degrees(usual):.2f}°"
         )
         if inner > INNER_GAP_RAD:
-            raise ValueError(f"{lacking}; reconstruct by 'pwls' or 'mbir', or interpolate the views")
+            raise ValueError(
+                f"{lacking}; reconstruct by 'pwls' or 'mbir', or interpolate the views"
+            )
         _LOG.warning("%s: the views beside it stand for those that lack", lacking)
 
 
@@ -73,8 +83,9 @@ def check_gaps(angles: Floats, period: float = 2.0 * math.pi) -> None:
 def parker_share(beta: Floats, gamma: Floats, half_fan: float) -> Floats:
     """Parker's smooth share of a reading in a scan of ``π + 2 · half_fan``.
 
-    With ``half_fan`` equal to the detector's it is Parker's minimal scan (Med. Phys. 9, 254, 1982); a larger value, the
-    virtual fan of Silver (Med. Phys. 27, 773, 2000), spreads the redundancy of an over-scan up to the full turn.
+    With ``half_fan`` equal to the detector's it is Parker's minimal scan (Med. Phys. 9, 254, 1982);
+    a larger value, the virtual fan of Silver (Med. Phys. 27, 773, 2000), spreads the redundancy of
+    an over-scan up to the full turn.
 
     Args:
         beta: source angle from the start of the scan in rad, 0 … π + 2 · half_fan; any shape.
@@ -88,10 +99,13 @@ def parker_share(beta: Floats, gamma: Floats, half_fan: float) -> Floats:
     rise = 2.0 * (half_fan + gamma)  # the line at β < rise is measured again at the end of the scan
     fall = math.pi + 2.0 * gamma
     end = math.pi + 2.0 * half_fan
-    # A ray at the fan's edge in a minimal scan meets its opposite at the very ends: one of the two, the first, counts.
+    # A ray at the fan's edge in a minimal scan meets its opposite at the very ends: one of the two,
+    # the first, counts.
     tiny = np.finfo(np.float64).tiny
     up = np.sin(0.5 * math.pi * np.clip(beta / np.maximum(rise, tiny), 0.0, 1.0)) ** 2
-    down = np.sin(0.5 * math.pi * np.clip((end - beta) / np.maximum(end - fall, tiny), 0.0, 1.0)) ** 2
+    down = (
+        np.sin(0.5 * math.pi * np.clip((end - beta) / np.maximum(end - fall, tiny), 0.0, 1.0)) ** 2
+    )
     share = np.where(beta < rise, up, np.where(beta < fall, 1.0, down))
     return np.where((beta < 0.0) | (beta > end), 0.0, share)
 
@@ -100,11 +114,13 @@ def parker_share(beta: Floats, gamma: Floats, half_fan: float) -> Floats:
 def offset_share(position: Floats) -> Floats:
     """Share of a reading in a full turn of an offset detector (Wang, Med. Phys. 29, 1634, 2002).
 
-    Lines that both halves of the turn measure are shared along a sine over the overlap, from 1 on the long side to 0
-    at the short edge, where the rows end; beyond the overlap the long side alone counts.
+    Lines that both halves of the turn measure are shared along a sine over the overlap, from 1 on
+    the long side to 0 at the short edge, where the rows end; beyond the overlap the long side alone
+    counts.
 
     Args:
-        position: fan angles or, of parallel rays, cell positions: ``(columns,)``, evenly spaced, increasing.
+        position: fan angles or, of parallel rays, cell positions: ``(columns,)``, evenly spaced,
+            increasing.
 
     Returns:
         ``(columns,)`` with ``share(p) + share(-p) = 1`` inside the overlap.
@@ -112,14 +128,18 @@ def offset_share(position: Floats) -> Floats:
     half_cell = 0.5 * (position[-1] - position[0]) / max(position.size - 1, 1)
     low, high = -(position[0] - half_cell), position[-1] + half_cell
     if min(low, high) <= 0:
-        raise ValueError("the detector does not reach the projection of the rotation axis: no turn measures all lines")
+        raise ValueError(
+            "the detector does not reach the projection of the rotation axis: no turn measures "
+            "all lines"
+        )
     side = 1.0 if high >= low else -1.0
     phase = np.clip(side * position / min(low, high), -1.0, 1.0)
     return 0.5 * (1.0 + np.sin(0.5 * math.pi * phase))
 
 
 def _reach(grid: VolumeGrid) -> float:
-    """How far a grid reaches from the axis in mm, the corners of one that is centred on it left aside."""
+    """How far a grid reaches from the axis in mm, the corners of one that is centred on it left
+    aside."""
     far = math.hypot(*grid.center[-2:])
     y, x = grid.extent[-2:]
     return far + (math.hypot(y, x) if far > 1e-6 * max(y, x) else max(y, x)) / 2
@@ -130,17 +150,22 @@ def angular_weights(geometry: Geometry, grid: VolumeGrid | None = None) -> Float
     """Weights of all readings: the angle of each view times the share of each column.
 
     Args:
-        geometry: parallel, fan or cone beam. Views may come in any order, irregularly spaced and repeated.
-        grid: what is reconstructed: a short scan of an offset detector is complete within its short side.
+        geometry: parallel, fan or cone beam. Views may come in any order, irregularly spaced and
+            repeated.
+        grid: what is reconstructed: a short scan of an offset detector is complete within its short
+            side.
 
     Returns:
         ``(views, columns)``, or ``(views, 1)`` where all columns share one weight; float64, rad.
-        Parallel: the steps over π. Divergent: half the steps over a closed circle, Parker's smooth weights over an arc.
-        A full turn of an offset detector (:func:`torchpcct.angles.is_offset`): the steps times :func:`offset_share`.
+        Parallel: the steps over π. Divergent: half the steps over a closed circle, Parker's smooth
+            weights over an arc.
+        A full turn of an offset detector (:func:`torchpcct.angles.is_offset`): the steps times
+            :func:`offset_share`.
 
     Raises:
-        ValueError: the views cover less than π (parallel) or π plus the fan angle (divergent), or less than a full
-            turn of a divergent beam with an offset detector; they are too few, or lack inside of the arc.
+        ValueError: the views cover less than π (parallel) or π plus the fan angle (divergent), or
+            less than a full turn of a divergent beam with an offset detector; they are too few, or
+            lack inside of the arc.
         TypeError: not a geometry.
     """
     if isinstance(geometry, ParallelBeam):
@@ -152,12 +177,15 @@ def angular_weights(geometry: Geometry, grid: VolumeGrid | None = None) -> Float
         steps, _, span = view_steps(geometry.angles, math.pi, PARALLEL_GAP_RAD)
         if span < math.pi:
             raise ValueError(
-                f"the views cover {math.degrees(span):.1f}°, but parallel rays need 180°: add views, or "
+                f"the views cover {math.degrees(span):.1f}°, but parallel rays need 180°: add "
+                "views, or "
                 'reconstruct by "pwls" or "mbir"'
             )
         return steps[:, None]
     if not isinstance(geometry, FanBeam | ConeBeam):
-        raise TypeError(f"geometry must be a ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}")
+        raise TypeError(
+            f"geometry must be a ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}"
+        )
     check_gaps(geometry.angles)
     steps, start, span = view_steps(geometry.angles)
     gamma = geometry.fan_angles
@@ -169,8 +197,10 @@ def angular_weights(geometry: Geometry, grid: VolumeGrid | None = None) -> Float
         field = geometry.fov_radius
         if grid is None or _reach(grid) > field * (1.0 + 1e-6):
             raise ValueError(
-                f"the detector is offset (fan {math.degrees(gamma[0]):.1f}° … {math.degrees(gamma[-1]):.1f}°), which "
-                f"needs a full turn, but the views cover {math.degrees(span):.1f}°: reconstruct no more than "
+                f"the detector is offset (fan {math.degrees(gamma[0]):.1f}° … "
+                f"{math.degrees(gamma[-1]):.1f}°), which "
+                f"needs a full turn, but the views cover {math.degrees(span):.1f}°: reconstruct "
+                "no more than "
                 f"{field:.4g} mm about the axis (the detector's short side), add views, or "
                 'reconstruct by "pwls" or "mbir"'
             )
@@ -178,11 +208,15 @@ def angular_weights(geometry: Geometry, grid: VolumeGrid | None = None) -> Float
     # The scan's ends are known to about one step, but a step may be wider than what may lack.
     if 2.0 * (reach - half_fan) > min(float(steps.max()), SHORT_RAD) * (1.0 + 1e-6):
         raise ValueError(
-            f"the views cover {math.degrees(span):.1f}°, but this fan needs 180° + {math.degrees(2 * reach):.1f}° = "
+            f"the views cover {math.degrees(span):.1f}°, but this fan needs 180° + "
+            f"{math.degrees(2 * reach):.1f}° = "
             f"{math.degrees(math.pi + 2 * reach):.1f}°: add views, or "
             'reconstruct by "pwls" or "mbir"'
         )
     beta = np.mod(geometry.angles - start, 2.0 * math.pi)
     virtual = max(half_fan, reach)
-    # Beyond the short side of an offset detector lines are measured once, if at all: no line of the field.
-    return steps[:, None] * parker_share(beta[:, None], np.clip(gamma, -virtual, virtual)[None, :], virtual)
+    # Beyond the short side of an offset detector lines are measured once, if at all: no line of the
+    # field.
+    return steps[:, None] * parker_share(
+        beta[:, None], np.clip(gamma, -virtual, virtual)[None, :], virtual
+    )

@@ -1,9 +1,11 @@
-"""FBP of scans that are not quite circles: detectors that tilt, roll and jitter, sources that wobble, mirrored axes.
+"""FBP of scans that are not quite circles: detectors that tilt, roll and jitter, sources that
+wobble, mirrored axes.
 
-Every view is resampled onto the upright flat detector of an ideal circle, seen from the view's own source: a projective
-map that keeps every line integral. What is left, the source's way off the circle, is a motion of the object, which the
-backprojection compensates view by view. Costs one interpolation; slower than a circular scan, and as general as
-filtered backprojection gets: an orbit that climbs (a helix) is refused.
+Every view is resampled onto the upright flat detector of an ideal circle, seen from the view's own
+source: a projective map that keeps every line integral. What is left, the source's way off the
+circle, is a motion of the object, which the backprojection compensates view by view. Costs one
+interpolation; slower than a circular scan, and as general as filtered backprojection gets: an orbit
+that climbs (a helix) is refused.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ __all__ = ["IdealCircle", "at_slices", "ideal_circle", "rebin_to_circle"]
 Floats = NDArray[np.float64]
 
 CLIMB = 0.05
-"""Way of the source along z that makes an orbit a helix, as a share of the height that the rows cover at the axis."""
+"""Way of the source along z that makes an orbit a helix, as a share of the height that the rows
+cover at the axis."""
 _TILTED_RAY = 1e-3
 
 
@@ -35,11 +38,12 @@ class IdealCircle(NamedTuple):
 
     Attributes:
         geometry: of the circle.
-        motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z, y, x) mm, or None.
+        motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z,
+            y, x) mm, or None.
         slices: heights of the slices of a parallel scan with rows in mm, else None.
         rows: positions of the ideal rows in mm; of a detector without rows 0.
-        maps: ``(views, 3, 3)``: (column position, row position, 1) on the ideal detector in mm to homogeneous
-            (columns, rows, 1) from the centre of the actual one.
+        maps: ``(views, 3, 3)``: (column position, row position, 1) on the ideal detector in mm to
+            homogeneous (columns, rows, 1) from the centre of the actual one.
     """
 
     geometry: Geometry
@@ -54,7 +58,8 @@ def ideal_circle(geometry: VectorGeometry) -> IdealCircle:
     """The ideal circle about z that a scan of any flat detectors can be resampled onto.
 
     Raises:
-        ValueError: an orbit that climbs, parallel rays that leave the plane, a detector before the axis.
+        ValueError: an orbit that climbs, parallel rays that leave the plane, a detector before the
+            axis.
     """
     work = _parallel if geometry.parallel else _divergent
     found = work(geometry.poses, geometry.rows or 1, geometry.columns, geometry.rows is not None)
@@ -72,7 +77,8 @@ def rebin_to_circle(sinogram: Tensor, geometry: VectorGeometry) -> tuple[Tensor,
         geometry: of the scan.
 
     Returns:
-        ``(..., views, [rows,] columns)``, of parallel rays with rows ``(..., slices, views, columns)``; and the circle.
+        ``(..., views, [rows,] columns)``, of parallel rays with rows ``(..., slices, views,
+        columns)``; and the circle.
 
     Raises:
         ValueError: a shape that does not fit; see :func:`ideal_circle`.
@@ -91,7 +97,8 @@ def rebin_to_circle(sinogram: Tensor, geometry: VectorGeometry) -> tuple[Tensor,
 
 @checked
 def at_slices(sinogram: Tensor, slices: Floats, grid: VolumeGrid) -> Tensor:
-    """Sinograms ``(..., z, views, columns)`` of a grid's slices, interpolated between those at the heights ``slices``.
+    """Sinograms ``(..., z, views, columns)`` of a grid's slices, interpolated between those at the
+    heights ``slices``.
 
     Raises:
         ValueError: a grid without z axis, or beyond the rows.
@@ -103,11 +110,15 @@ def at_slices(sinogram: Tensor, slices: Floats, grid: VolumeGrid) -> Tensor:
     half = 0.5 * float(slices[1] - slices[0]) if slices.size > 1 else 0.0
     slack = 1e-6 * max(half, grid.spacing[0])
     if grid.axes[0][0] < slices[0] - half - slack or grid.axes[0][-1] > slices[-1] + half + slack:
-        raise ValueError(f"the grid's slices must lie in the rows' {slices[0]:g} … {slices[-1]:g} mm")
+        raise ValueError(
+            f"the grid's slices must lie in the rows' {slices[0]:g} … {slices[-1]:g} mm"
+        )
     below = np.minimum(place.astype(int), max(slices.size - 2, 0))
     share = torch.from_numpy(place - below).to(sinogram)[:, None, None]
     above = torch.from_numpy(np.minimum(below + 1, slices.size - 1))
-    return torch.lerp(sinogram[..., torch.from_numpy(below), :, :], sinogram[..., above, :, :], share)
+    return torch.lerp(
+        sinogram[..., torch.from_numpy(below), :, :], sinogram[..., above, :, :], share
+    )
 
 
 def _axis_of(low: float, high: float, pitch: float) -> tuple[int, float]:
@@ -124,16 +135,29 @@ def _divergent(poses: Floats, rows: int, columns: int, cone: bool) -> IdealCircl
     sod, level = float(orbit.mean()), float(source[:, 2].mean())
     depth = ((source - centre) * radial).sum(1)
     if depth.min() <= 0:
-        raise ValueError(f"the detector of view {int(depth.argmin())} does not stand behind the axis")
+        raise ValueError(
+            f"the detector of view {int(depth.argmin())} does not stand behind the axis"
+        )
     sdd = float(depth.mean())
     if sdd <= sod:
-        raise ValueError(f"the detectors stand {sdd:g} mm from the sources, which turn at {sod:g} mm: before the axis")
+        raise ValueError(
+            f"the detectors stand {sdd:g} mm from the sources, which turn at {sod:g} mm: before "
+            "the axis"
+        )
     # Where the actual corners meet the ideal plane, seen from the actual source.
     half = np.array([(a * (columns - 1) / 2, b * (rows - 1) / 2) for a in (-1, 1) for b in (-1, 1)])
-    corner = centre[:, None] + half[:, :1] * across[:, None] + half[:, 1:] * up[:, None] - source[:, None]
+    corner = (
+        centre[:, None]
+        + half[:, :1] * across[:, None]
+        + half[:, 1:] * up[:, None]
+        - source[:, None]
+    )
     towards = -(corner * radial[:, None]).sum(-1)
     if towards.min() <= 0:
-        raise ValueError("a detector reaches behind its source: are the vectors in the order source, centre, u, v?")
+        raise ValueError(
+            "a detector reaches behind its source: are the vectors in the order source, centre, "
+            "u, v?"
+        )
     scale = sdd / towards
     u, w = (corner * tangent[:, None]).sum(-1) * scale, corner[..., 2] * scale
     middle = sdd / depth
@@ -145,18 +169,25 @@ def _divergent(poses: Floats, rows: int, columns: int, cone: bool) -> IdealCircl
         climb = float(np.ptp(source[:, 2]))
         if climb > CLIMB * height:
             raise ValueError(
-                f"the source climbs by {climb:.2f} mm, the rows cover {height:.2f} mm at the axis: filtered "
+                f"the source climbs by {climb:.2f} mm, the rows cover {height:.2f} mm at the "
+                "axis: filtered "
                 'backprojection of a helix is not provided. Use the method "pwls" (recon.pwls with '
                 "Projector(geometry, grid))"
             )
         number, middle_row = _axis_of(float(w.min()), float(w.max()), row_pitch)
-        geometry: Any = ConeBeam(beta, sod, sdd, count, number, (row_pitch, pitch), (middle_row, offset))
+        geometry: Any = ConeBeam(
+            beta, sod, sdd, count, number, (row_pitch, pitch), (middle_row, offset)
+        )
         v = geometry.row_positions
     else:
         geometry, v = FanBeam(beta, sod, sdd, count, pitch, offset), np.zeros(1)
-    # source + k · ray = centre + a · across + b · up, where the ray goes to a place of the ideal detector.
+    # source + k · ray = centre + a · across + b · up, where the ray goes to a place of the ideal
+    # detector.
     upward = np.broadcast_to([0.0, 0.0, 1.0], radial.shape)
-    actual, wanted = np.stack([across, up, centre - source], -1), np.stack([tangent, upward, -sdd * radial], -1)
+    actual, wanted = (
+        np.stack([across, up, centre - source], -1),
+        np.stack([tangent, upward, -sdd * radial], -1),
+    )
     maps = np.linalg.solve(actual, wanted)
     ends = np.array([(x, y, 1.0) for x in geometry.column_positions[[0, -1]] for y in v[[0, -1]]])
     if (maps[:, 2] @ ends.T).min() <= 0:
@@ -164,7 +195,9 @@ def _divergent(poses: Floats, rows: int, columns: int, cone: bool) -> IdealCircl
     ideal = sod * radial + np.array([0.0, 0.0, level])
     shift = (ideal - source)[:, ::-1]
     shift[:, 0] -= level  # an orbit about another height is a grid that is lower by as much
-    return IdealCircle(geometry, np.ascontiguousarray(shift if cone else shift[:, 1:]), None, v, maps)
+    return IdealCircle(
+        geometry, np.ascontiguousarray(shift if cone else shift[:, 1:]), None, v, maps
+    )
 
 
 def _parallel(poses: Floats, rows: int, columns: int, cone: bool) -> IdealCircle:
@@ -172,8 +205,10 @@ def _parallel(poses: Floats, rows: int, columns: int, cone: bool) -> IdealCircle
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
     if np.abs(ray[:, 2]).max() > _TILTED_RAY:
         raise ValueError(
-            f"the rays leave the plane of rotation by up to {math.degrees(math.asin(np.abs(ray[:, 2]).max())):.2f}°: "
-            "slices cannot be reconstructed one by one. Filtered backprojection of tilted rays is not provided: use "
+            "the rays leave the plane of rotation by up to "
+            f"{math.degrees(math.asin(np.abs(ray[:, 2]).max())):.2f}°: "
+            "slices cannot be reconstructed one by one. Filtered backprojection of tilted rays is "
+            "not provided: use "
             'the method "pwls" (recon.pwls with Projector(geometry, grid))'
         )
     beta = np.arctan2(-ray[:, 1], -ray[:, 0])
@@ -192,11 +227,17 @@ def _parallel(poses: Floats, rows: int, columns: int, cone: bool) -> IdealCircle
     heights: Any = np.zeros(1)
     if cone:
         row_pitch = float(np.median(np.linalg.norm(b, axis=1)))
-        number, middle = _axis_of(float(corner[..., 1].min()), float(corner[..., 1].max()), row_pitch)
+        number, middle = _axis_of(
+            float(corner[..., 1].min()), float(corner[..., 1].max()), row_pitch
+        )
         heights = (np.arange(number) - (number - 1) / 2) * row_pitch + middle
     inverse = np.linalg.inv(matrix)
     maps = np.zeros((len(poses), 3, 3))
-    maps[:, :2, :2], maps[:, :2, 2], maps[:, 2, 2] = inverse, -np.einsum("nij,nj->ni", inverse, c), 1.0
+    maps[:, :2, :2], maps[:, :2, 2], maps[:, 2, 2] = (
+        inverse,
+        -np.einsum("nij,nj->ni", inverse, c),
+        1.0,
+    )
     return IdealCircle(geometry, None, heights if cone else None, heights, maps)
 
 
@@ -227,10 +268,12 @@ def _resampled(sinogram: Tensor, circle: IdealCircle) -> Tensor:
 
 
 def _weights(at: Floats, cells: int) -> tuple[Floats, NDArray[np.int64]]:
-    """Of the four cells about each place their weights ``(4, places)`` and numbers; one cell weighs 1.
+    """Of the four cells about each place their weights ``(4, places)`` and numbers; one cell weighs
+    1.
 
-    Keys (1981, IEEE Trans. Acoust. 29:1153), a = -1/2: straight lines and parabolas are kept. What torch interpolates
-    with, a = -3/4, moves a slope by up to a twentieth of a cell, there and back between two cells.
+    Keys (1981, IEEE Trans. Acoust. 29:1153), a = -1/2: straight lines and parabolas are kept. What
+    torch interpolates with, a = -3/4, moves a slope by up to a twentieth of a cell, there and back
+    between two cells.
     """
     if cells == 1:
         return np.ones((1, at.size)), np.zeros((1, at.size), np.int64)

@@ -21,13 +21,17 @@ from torchpcct.vector_geometry import check_motion
 __all__ = ["BackprojectionPlan", "backproject", "check_data", "data_shape"]
 
 _KIND = {"parallel": 0, "flat": 1, "curved": 2}
-#: Voxel columns of one task of the 3-D backprojection: small enough for the caches, large enough to share look-ups.
+# : Voxel columns of one task of the 3-D backprojection: small enough for the caches, large enough
+# to share look-ups.
 _TILES = ((12, 24), (8, 12))
-#: Polynomial lengths of the arc tangent, for usual fans and for half-fans near 90°: one compiled variant each.
+# : Polynomial lengths of the arc tangent, for usual fans and for half-fans near 90°: one compiled
+# variant each.
 _ATAN_TERMS = {torch.float32: (7, 20), torch.float64: (12, 20)}
-#: Errors of the fan angle, in columns, at which the longer polynomial takes over: far below rounding.
+# : Errors of the fan angle, in columns, at which the longer polynomial takes over: far below
+# rounding.
 _ATAN_TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}
-#: Rows of a slab at least: products of a matrix with fewer rows are summed in another order by some libraries.
+# : Rows of a slab at least: products of a matrix with fewer rows are summed in another order by
+# some libraries.
 _FEWEST_ROWS = 8
 
 
@@ -47,9 +51,14 @@ def _atan_polynomial(reach: float, columns_per_rad: float, dtype: torch.dtype) -
 @checked
 def check_data(name: str, data: Any, shape: tuple[int, ...]) -> None:
     if not isinstance(data, Tensor):
-        raise TypeError(f"{name} must be a torch.Tensor, got {type(data).__name__}: use torch.as_tensor")
+        raise TypeError(
+            f"{name} must be a torch.Tensor, got {type(data).__name__}: use torch.as_tensor"
+        )
     if data.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"{name} must be float32 or float64, got {data.dtype}: convert it with .float() or .double()")
+        raise TypeError(
+            f"{name} must be float32 or float64, got {data.dtype}: convert it with .float() or "
+            ".double()"
+        )
     if data.ndim < len(shape) or tuple(data.shape[data.ndim - len(shape) :]) != shape:
         expected = ", ".join(["...", *map(str, shape)])
         raise ValueError(f"{name} must have the shape ({expected}), got {tuple(data.shape)}")
@@ -63,9 +72,12 @@ def data_shape(geometry: Geometry, window: DetectorWindow) -> tuple[int, ...]:
 
 
 class BackprojectionPlan:
-    """Geometry of one backprojection, and its two maps for numba; arguments as of :func:`backproject`."""
+    """Geometry of one backprojection, and its two maps for numba; arguments as of
+    :func:`backproject`."""
 
-    def __init__(self, geometry: Geometry, grid: VolumeGrid, window: DetectorWindow, motion: Any = None) -> None:
+    def __init__(
+        self, geometry: Geometry, grid: VolumeGrid, window: DetectorWindow, motion: Any = None
+    ) -> None:
         self.grid, self.window = grid, window
         self.cone = isinstance(geometry, ConeBeam)
         if isinstance(geometry, ParallelBeam):
@@ -74,17 +86,23 @@ class BackprojectionPlan:
             self.kind, self.sod, self.sdd = _KIND[geometry.detector], geometry.sod, geometry.sdd
             pitch = geometry.pitch if isinstance(geometry, FanBeam) else geometry.pitch[1]
         else:
-            raise TypeError(f"geometry must be a ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}")
+            raise TypeError(
+                "geometry must be a ParallelBeam, FanBeam or ConeBeam, got "
+                f"{type(geometry).__name__}"
+            )
         axes = 3 if self.cone else 2
         if grid.ndim != axes:
-            raise ValueError(f"a {type(geometry).__name__} needs a {axes}-D grid, got {grid.ndim} axes")
+            raise ValueError(
+                f"a {type(geometry).__name__} needs a {axes}-D grid, got {grid.ndim} axes"
+            )
         window.check(geometry)
         self.cosines, self.sines = np.cos(geometry.angles), np.sin(geometry.angles)
         self.shifts = _shifts(motion, self.cosines, self.sines, grid.ndim)
         self.travel = float(np.hypot(self.shifts[:, 0], self.shifts[:, 1]).max())
         if self.kind != 0 and grid.in_plane_radius + self.travel >= self.sod:
             raise ValueError(
-                f"the grid reaches {grid.in_plane_radius + self.travel:.1f} mm from the axis, beyond the source orbit "
+                f"the grid reaches {grid.in_plane_radius + self.travel:.1f} mm from the axis, "
+                "beyond the source orbit "
                 f"(sod {self.sod} mm): move or shrink the grid"
             )
         self.scale = 1.0 / pitch
@@ -100,7 +118,8 @@ class BackprojectionPlan:
     def _outside(self, geometry: Any) -> NDArray[np.bool_] | None:
         """Voxel columns that some view may not see, or None. An inset must be seen whole.
 
-        A grid that moves loses the voxels that its longest displacement could take out of the field of view."""
+        A grid that moves loses the voxels that its longest displacement could take out of the field
+        of view."""
         if isinstance(geometry, ParallelBeam):
             u = geometry.column_positions
             radius = max(min(-u[0], u[-1]) + geometry.pitch / 2.0, 0.0)
@@ -115,16 +134,20 @@ class BackprojectionPlan:
         cy, cx = self.grid.center[-2:]
         if abs(cy) > half_y or abs(cx) > half_x or outside.all():
             raise ValueError(
-                f"the grid (centre x {cx:g}, y {cy:g} mm, {2 * half_x:g} × {2 * half_y:g} mm) leaves the field of view "
+                f"the grid (centre x {cx:g}, y {cy:g} mm, {2 * half_x:g} × {2 * half_y:g} mm) "
+                "leaves the field of view "
                 f"of radius {radius:.2f} mm: move or shrink it"
             )
         return outside
 
     def _check_window(self, geometry: Any) -> None:
-        """Every neighbour that interpolation reads must be in the window, or beyond the detector's edge."""
+        """Every neighbour that interpolation reads must be in the window, or beyond the
+        detector's edge."""
         if self.mask is not None:
             if self.window.columns != geometry.columns:
-                raise ValueError("a grid that is larger than the field of view needs all columns: pass no window")
+                raise ValueError(
+                    "a grid that is larger than the field of view needs all columns: pass no window"
+                )
             return
         y, x = self.grid.axes[-2:]
         cy, cx = np.meshgrid(y[[0, -1]], x[[0, -1]], indexing="ij")
@@ -136,27 +159,39 @@ class BackprojectionPlan:
         elif self.kind == 1:
             position, height = self.sdd * across / depth, self.sdd / depth
         else:
-            position, height = self.sdd * np.arctan2(across, depth), self.sdd / np.hypot(across, depth)
+            position, height = (
+                self.sdd * np.arctan2(across, depth),
+                self.sdd / np.hypot(across, depth),
+            )
         index = position * self.scale + self.starts[:, None]
         first = self.window.first_column
         low, high = index.min(axis=1), index.max(axis=1)
         missing = (low < -1e-6) & (first > 0)
-        missing |= (high > self.window.columns - 1 + 1e-6) & (first + self.window.columns < geometry.columns)
+        missing |= (high > self.window.columns - 1 + 1e-6) & (
+            first + self.window.columns < geometry.columns
+        )
         if missing.any():
             raise ValueError(
                 f"the window misses columns that the grid needs in view {int(np.argmax(missing))}: "
                 "use torchpcct.detector_window.footprint(geometry, grid, margin=1, motion=motion)"
             )
         if isinstance(geometry, ConeBeam):
-            z = self.grid.axes[0][[0, -1]] + np.array([self.shifts[:, 2].min(), self.shifts[:, 2].max()])
-            row = z[:, None] * np.array([height.min(), height.max()]) * self.row_scale + self.row_start
+            z = self.grid.axes[0][[0, -1]] + np.array(
+                [self.shifts[:, 2].min(), self.shifts[:, 2].max()]
+            )
+            row = (
+                z[:, None] * np.array([height.min(), height.max()]) * self.row_scale
+                + self.row_start
+            )
             w = self.window
             short = row.min() < -1e-6 and w.first_row > 0
             short |= row.max() > w.rows - 1 + 1e-6 and w.first_row + w.rows < geometry.rows
             if short:
                 raise ValueError(
-                    f"the window's rows {w.first_row}…{w.first_row + w.rows - 1} do not cover the grid: "
-                    "use torchpcct.detector_window.footprint(geometry, grid, margin=1, motion=motion)"
+                    f"the window's rows {w.first_row}…{w.first_row + w.rows - 1} do not cover the "
+                    "grid: "
+                    "use torchpcct.detector_window.footprint(geometry, grid, margin=1, "
+                    "motion=motion)"
                 )
 
     def _arguments(self, dtype: torch.dtype) -> list[Any]:
@@ -172,7 +207,8 @@ class BackprojectionPlan:
         return [*common, _atan_polynomial(reach, self.sdd * self.scale, dtype)]
 
     def _tile(self) -> tuple[int, int]:
-        """The largest tile over which heights on the detector change by about a row at most, if one will do."""
+        """The largest tile over which heights on the detector change by about a row at most, if
+        one will do."""
         _, dy, dx = self.grid.spacing
         reach = float(np.abs(self.grid.axes[0]).max()) * self.row_scale
         near = max(self.sod - math.hypot(*self.grid.center[1:]), 0.1 * self.sod)
@@ -183,22 +219,33 @@ class BackprojectionPlan:
         return _TILES[0]
 
     def rows(self, first: int, stop: int) -> tuple[int, int]:
-        """Of a cone beam: the first row of the window that the slices ``first`` … ``stop - 1`` read, and the one after
-        their last."""
+        """Of a cone beam: the first row of the window that the slices ``first`` … ``stop - 1``
+        read, and the one after their last."""
         seen = self.radius if self.mask is not None else self.grid.in_plane_radius
         radius = min(seen, self.grid.in_plane_radius) + self.travel
-        z = self.grid.axes[0][[first, stop - 1]] + np.array([self.shifts[:, 2].min(), self.shifts[:, 2].max()])
+        z = self.grid.axes[0][[first, stop - 1]] + np.array(
+            [self.shifts[:, 2].min(), self.shifts[:, 2].max()]
+        )
         heights = self.sdd / (self.sod + np.array([-radius, radius])) * self.row_scale
         row = np.outer(z, heights) + self.row_start
-        # What a row needs of its neighbours, and a kink of a tile that reaches beyond the field of view.
+        # What a row needs of its neighbours, and a kink of a tile that reaches beyond the field of
+        # view.
         low = int(np.clip(math.floor(row.min()) - 3, 0, max(self.window.rows - _FEWEST_ROWS, 0)))
-        return low, int(np.clip(math.floor(row.max()) + 4, min(low + _FEWEST_ROWS, self.window.rows), self.window.rows))
+        return low, int(
+            np.clip(
+                math.floor(row.max()) + 4,
+                min(low + _FEWEST_ROWS, self.window.rows),
+                self.window.rows,
+            )
+        )
 
-    def forward(self, data: Tensor, slices: tuple[int, int] | None = None, first_row: int = 0) -> Tensor:
+    def forward(
+        self, data: Tensor, slices: tuple[int, int] | None = None, first_row: int = 0
+    ) -> Tensor:
         """``(..., views, [rows,] columns)`` to ``(..., [z,] y, x)``.
 
-        Of a cone beam, with ``slices`` (first, stop) only these of the volume, from the rows of the window that start
-        at ``first_row`` and hold :meth:`rows`: the same bits as in the whole.
+        Of a cone beam, with ``slices`` (first, stop) only these of the volume, from the rows of the
+        window that start at ``first_row`` and hold :meth:`rows`: the same bits as in the whole.
         """
         from recon.analytic import backproject_kernels as kernels  # numba loads with its first use
 
@@ -214,8 +261,18 @@ class BackprojectionPlan:
                 tile, z = self._tile(), self.grid.axes[0]
                 arguments[6] = z[first:stop]
                 arguments += [float(first_row), z[0], z[-1]]
-                tasks = len(out) * math.prod(-(-n // t) for n, t in zip(out.shape[-2:], tile, strict=True))
-                run(kernels.backproject_3d, tasks, self.kind, numbers, *arguments, *tile, out.numpy())
+                tasks = len(out) * math.prod(
+                    -(-n // t) for n, t in zip(out.shape[-2:], tile, strict=True)
+                )
+                run(
+                    kernels.backproject_3d,
+                    tasks,
+                    self.kind,
+                    numbers,
+                    *arguments,
+                    *tile,
+                    out.numpy(),
+                )
             else:
                 tasks = len(out) * -(-out.shape[1] // kernels.ROWS)
                 run(kernels.backproject_2d, tasks, self.kind, numbers, *arguments, out.numpy())
@@ -224,7 +281,8 @@ class BackprojectionPlan:
         return out.view(*lead, *shape_out)
 
     def transpose(self, volume: Tensor) -> Tensor:
-        """``(..., [z,] y, x)`` to ``(..., views, [rows,] columns)``: the exact transpose of :meth:`forward`."""
+        """``(..., [z,] y, x)`` to ``(..., views, [rows,] columns)``: the exact transpose of
+        :meth:`forward`."""
         from recon.analytic import backproject_kernels as kernels  # numba loads with its first use
 
         n = self.grid.ndim
@@ -239,10 +297,24 @@ class BackprojectionPlan:
             arguments = self._arguments(volume.dtype)
             if self.cone:
                 numbers = volume.permute(0, 2, 3, 1).contiguous().numpy()
-                run(kernels.spread_3d, len(out) * w.views, self.kind, numbers, *arguments, out.numpy())
+                run(
+                    kernels.spread_3d,
+                    len(out) * w.views,
+                    self.kind,
+                    numbers,
+                    *arguments,
+                    out.numpy(),
+                )
             else:
                 numbers = volume.contiguous().numpy()
-                run(kernels.spread_2d, len(out) * w.views, self.kind, numbers, *arguments, out.numpy())
+                run(
+                    kernels.spread_2d,
+                    len(out) * w.views,
+                    self.kind,
+                    numbers,
+                    *arguments,
+                    out.numpy(),
+                )
         return out.view(*lead, *shape)
 
 
@@ -268,29 +340,33 @@ def backproject(
     *,
     motion: Any = None,
 ) -> Tensor:
-    """Backproject filtered data with FBP's distance weights: the second half of filtered backprojection.
+    """Backproject filtered data with FBP's distance weights: the second half of filtered
+    backprojection.
 
-    Voxel driven, with linear interpolation along columns and rows. A voxel whose footprint lies above or below the
-    detector's rows reads the outermost row. It is not the adjoint of a projector; that is the projector's ``T``.
+    Voxel driven, with linear interpolation along columns and rows. A voxel whose footprint lies
+    above or below the detector's rows reads the outermost row. It is not the adjoint of a
+    projector; that is the projector's ``T``.
 
     Args:
-        filtered: result of ``filter_sinogram``, ``(..., views, [rows,] columns)``, float32 or float64.
+        filtered: result of ``filter_sinogram``, ``(..., views, [rows,] columns)``, float32 or
+            float64.
         geometry: parallel or fan beam (2-D grid), or cone beam (3-D grid).
-        grid: voxels to reconstruct. A grid about the isocentre may be larger than the field of view: voxels outside
-            are 0. A grid beside the isocentre must lie inside.
-        window: the readings that ``filtered`` holds, default: the whole detector. It must hold the grid's footprint,
-            ``torchpcct.detector_window.footprint(geometry, grid, margin=1, motion=motion)``.
-        motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z, y, x) mm as for
-            :class:`torchpcct.projector.Projector`, or None: everything that the data hold moves with the grid, and the
-            image shows it at rest. What stands still must be backprojected on its own, without motion (see
-            :class:`recon.analytic.inset.InsetFbp`).
+        grid: voxels to reconstruct. A grid about the isocentre may be larger than the field of
+            view: voxels outside are 0. A grid beside the isocentre must lie inside.
+        window: the readings that ``filtered`` holds, default: the whole detector. It must hold the
+            grid's footprint, ``torchpcct.detector_window.footprint(geometry, grid, margin=1,
+            motion=motion)``.
+        motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z,
+            y, x) mm as for :class:`torchpcct.projector.Projector`, or None: everything that the
+            data hold moves with the grid, and the image shows it at rest. What stands still must be
+            backprojected on its own, without motion (see :class:`recon.analytic.inset.InsetFbp`).
 
     Returns:
         ``(..., *grid.shape)`` mm⁻¹, dtype and device of ``filtered``. Differentiable to any order.
 
     Raises:
-        ValueError: a wrong shape, a grid outside the field of view or the source's orbit, a window that is too small,
-            a motion that is not finite.
+        ValueError: a wrong shape, a grid outside the field of view or the source's orbit, a window
+            that is too small, a motion that is not finite.
         TypeError: data that are not float32 or float64 tensors, or not a geometry.
     """
     if window is None:

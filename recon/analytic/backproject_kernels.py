@@ -1,11 +1,13 @@
 """Numba kernels of the voxel-driven backprojector and of its exact transpose.
 
-Every voxel belongs to one task of the backprojection and every view to one task of the transpose, each with a fixed
-order of summation: results do not depend on the number of threads. Positions on a curved detector are
-``γ = 2 atan(across / (distance + depth))``, with the arc tangent as a polynomial that is fitted to the fans that
-occur, because a library call per voxel and view would cost more than all the rest.
+Every voxel belongs to one task of the backprojection and every view to one task of the transpose,
+each with a fixed order of summation: results do not depend on the number of threads. Positions on a
+curved detector are ``γ = 2 atan(across / (distance + depth))``, with the arc tangent as a
+polynomial that is fitted to the fans that occur, because a library call per voxel and view would
+cost more than all the rest.
 
-``shifts (views, 3)`` displaces the grid in every view: towards the source, along the columns, upwards, in mm.
+``shifts (views, 3)`` displaces the grid in every view: towards the source, along the columns,
+upwards, in mm.
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ from numba import njit
 
 __all__ = ["ROWS", "backproject_2d", "backproject_3d", "spread_2d", "spread_3d"]
 
-PARALLEL, FLAT, CURVED = 0, 1, 2
+PARALLEL = 0
+FLAT = 1
+CURVED = 2
 ROWS = 16
 """Rows of a task of :func:`backproject_2d`."""
 
@@ -30,7 +34,9 @@ _BARE: Any = {**_INLINE, "_nrt": False}  # without reference counts: for what al
 
 
 @njit(**_INLINE)
-def _positions_2d(kind, x, y, c, s, toward, aside, sod, sdd, scale, start, last, atan, index, near, far):
+def _positions_2d(
+    kind, x, y, c, s, toward, aside, sod, sdd, scale, start, last, atan, index, near, far
+):
     """Left neighbour and the two weights of a line of pixels, in the precision of ``x``."""
     number = x.dtype.type
     zero, one, edge, first = number(0), number(1), number(last), number(start)
@@ -67,7 +73,9 @@ def _positions_2d(kind, x, y, c, s, toward, aside, sod, sdd, scale, start, last,
 
 
 @njit(**_OPTIONS)
-def backproject_2d(begin, end, kind, data, cosines, sines, shifts, starts, x, y, sod, sdd, scale, atan, out):
+def backproject_2d(
+    begin, end, kind, data, cosines, sines, shifts, starts, x, y, sod, sdd, scale, atan, out
+):
     """``data (B, V, columns)`` into ``out (B, Y, X)``."""
     _, views, columns = data.shape
     ny, nx = out.shape[1], out.shape[2]
@@ -90,9 +98,23 @@ def backproject_2d(begin, end, kind, data, cosines, sines, shifts, starts, x, y,
             row[columns] = number(0)  # read with weight 0 at the last column's centre
             for iy in range(first, stop):
                 _positions_2d(
-                    kind, xs, y[iy], cosines[v], sines[v], shifts[v, 0], shifts[v, 1], sod, sdd, scale, starts[v],
-                    columns - 1, atan, index, near, far,
-                )  # fmt: skip
+                    kind,
+                    xs,
+                    y[iy],
+                    cosines[v],
+                    sines[v],
+                    shifts[v, 0],
+                    shifts[v, 1],
+                    sod,
+                    sdd,
+                    scale,
+                    starts[v],
+                    columns - 1,
+                    atan,
+                    index,
+                    near,
+                    far,
+                )
                 line = total[iy - first]
                 for i in range(nx):
                     k = np.uint32(index[i])
@@ -103,7 +125,9 @@ def backproject_2d(begin, end, kind, data, cosines, sines, shifts, starts, x, y,
 
 
 @njit(**_OPTIONS)
-def spread_2d(begin, end, kind, volume, cosines, sines, shifts, starts, x, y, sod, sdd, scale, atan, out):
+def spread_2d(
+    begin, end, kind, volume, cosines, sines, shifts, starts, x, y, sod, sdd, scale, atan, out
+):
     """Transpose of :func:`backproject_2d`: ``volume (B, Y, X)`` into ``out (B, V, columns)``."""
     _, views, columns = out.shape
     ny, nx = volume.shape[1], volume.shape[2]
@@ -118,9 +142,23 @@ def spread_2d(begin, end, kind, volume, cosines, sines, shifts, starts, x, y, so
             xs[i] = number(x[i])
         for iy in range(ny):
             _positions_2d(
-                kind, xs, y[iy], cosines[v], sines[v], shifts[v, 0], shifts[v, 1], sod, sdd, scale, starts[v],
-                columns - 1, atan, index, near, far,
-            )  # fmt: skip
+                kind,
+                xs,
+                y[iy],
+                cosines[v],
+                sines[v],
+                shifts[v, 0],
+                shifts[v, 1],
+                sod,
+                sdd,
+                scale,
+                starts[v],
+                columns - 1,
+                atan,
+                index,
+                near,
+                far,
+            )
             for i in range(nx):
                 k = np.uint32(index[i])
                 row[k] += near[i] * volume[b, iy, i]
@@ -130,8 +168,11 @@ def spread_2d(begin, end, kind, volume, cosines, sines, shifts, starts, x, y, so
 
 
 @njit(**_INLINE)
-def _positions_3d(kind, x, y, c, s, toward, aside, sod, sdd, scale, start, atan, index, weight, height):
-    """Column position, distance weight and magnification of heights of voxel columns, in float64."""
+def _positions_3d(
+    kind, x, y, c, s, toward, aside, sod, sdd, scale, start, atan, index, weight, height
+):
+    """Column position, distance weight and magnification of heights of voxel columns, in
+    float64."""
     for p in range(x.size):
         across = (y[p] * c - x[p] * s) + aside
         depth = (sod - toward) - (x[p] * c + y[p] * s)
@@ -153,16 +194,18 @@ def _positions_3d(kind, x, y, c, s, toward, aside, sod, sdd, scale, start, atan,
             weight[p] = sod * sod / square
 
 
-# These two take whole arrays and indices: a row as an array of its own costs more (reference counts) than its loop.
+# These two take whole arrays and indices: a row as an array of its own costs more (reference
+# counts) than its loop.
 
 
 @njit(inline="always", **_INLINE)
 def _add_by_kink(near, far, table, m, z, tau, step, total, p):
-    """One voxel column: ``total[p] += row interpolation``, three rows of each neighbour for every voxel.
+    """One voxel column: ``total[p] += row interpolation``, three rows of each neighbour for every
+    voxel.
 
-    Where the heights of a voxel on the detector stay within one row of row κ for the whole tile, interpolation is
-    ``g(κ) + min(t, 0) · (g(κ) − g(κ−1)) + max(t, 0) · (g(κ+1) − g(κ))`` with t the distance from κ: no index depends
-    on the voxel column, and the loop along z vectorises.
+    Where the heights of a voxel on the detector stay within one row of row κ for the whole tile,
+    interpolation is ``g(κ) + min(t, 0) · (g(κ) − g(κ−1)) + max(t, 0) · (g(κ+1) − g(κ))`` with t the
+    distance from κ: no index depends on the voxel column, and the loop along z vectorises.
     """
     zero, n = z.dtype.type(0), m + np.uint64(1)
     for k in range(np.uint64(z.size)):
@@ -195,10 +238,26 @@ def _add_by_index(near, far, turned, m, z, step, origin, below, column, lower, u
 
 @njit(**_BARE)
 def _add_view(
-    index, weight, height, first, last, row_scale, kink, table, tau, turned, origin, below, column, lower, upper,
-    heights, total,
-):  # fmt: skip
-    """What one view adds to every voxel column of a tile; apart, because it needs no reference counts."""
+    index,
+    weight,
+    height,
+    first,
+    last,
+    row_scale,
+    kink,
+    table,
+    tau,
+    turned,
+    origin,
+    below,
+    column,
+    lower,
+    upper,
+    heights,
+    total,
+):
+    """What one view adds to every voxel column of a tile; apart, because it needs no reference
+    counts."""
     number = total.dtype.type
     for p in range(index.size):
         position = min(max(index[p], 0.0), last)
@@ -211,18 +270,43 @@ def _add_view(
         if kink:
             _add_by_kink(near, far, table, m, heights, tau, step, total, q)
         else:
-            _add_by_index(near, far, turned, m, heights, step, origin, below, column, lower, upper, total, q)
+            _add_by_index(
+                near, far, turned, m, heights, step, origin, below, column, lower, upper, total, q
+            )
 
 
 @njit(**_OPTIONS)
 def backproject_3d(
-    begin, end, kind, data, cosines, sines, shifts, starts, x, y, z, sod, sdd, scale, row_scale, row_start, atan,
-    first_row, bottom, top, tile_y, tile_x, out,
-):  # fmt: skip
-    """``data (B, V, rows, columns)`` into ``out (B, Z, Y, X)``, tile by tile of ``tile_y × tile_x`` voxel columns.
+    begin,
+    end,
+    kind,
+    data,
+    cosines,
+    sines,
+    shifts,
+    starts,
+    x,
+    y,
+    z,
+    sod,
+    sdd,
+    scale,
+    row_scale,
+    row_start,
+    atan,
+    first_row,
+    bottom,
+    top,
+    tile_y,
+    tile_x,
+    out,
+):
+    """``data (B, V, rows, columns)`` into ``out (B, Z, Y, X)``, tile by tile of ``tile_y × tile_x``
+    voxel columns.
 
-    ``z`` may be some slices of a volume that reaches from ``bottom`` to ``top``, and ``data`` the rows from
-    ``first_row`` that they read: every voxel then gets the same bits as in the whole volume.
+    ``z`` may be some slices of a volume that reaches from ``bottom`` to ``top``, and ``data`` the
+    rows from ``first_row`` that they read: every voxel then gets the same bits as in the whole
+    volume.
     """
     _, views, rows, columns = data.shape
     nz, ny, nx = out.shape[1], out.shape[2], out.shape[3]
@@ -252,9 +336,22 @@ def backproject_3d(
         lower, upper = np.empty(padded, np.int32), np.empty(padded, data.dtype)
         for v in range(views):
             _positions_3d(
-                kind, px, py, cosines[v], sines[v], shifts[v, 0], shifts[v, 1], sod, sdd, scale, starts[v], atan,
-                index, weight, height,
-            )  # fmt: skip
+                kind,
+                px,
+                py,
+                cosines[v],
+                sines[v],
+                shifts[v, 0],
+                shifts[v, 1],
+                sod,
+                sdd,
+                scale,
+                starts[v],
+                atan,
+                index,
+                weight,
+                height,
+            )
             lift = shifts[v, 2]
             for k in range(nz):
                 heights[k] = number(z[k] + lift)
@@ -288,9 +385,24 @@ def backproject_3d(
                         d[k] = here - source[j]
                         e[k] = source[j + np.uint32(2)] - here
             _add_view(
-                index, weight, height, first, last, row_scale, kink, table, tau, turned, origin, below, column, lower,
-                upper, heights, total,
-            )  # fmt: skip
+                index,
+                weight,
+                height,
+                first,
+                last,
+                row_scale,
+                kink,
+                table,
+                tau,
+                turned,
+                origin,
+                below,
+                column,
+                lower,
+                upper,
+                heights,
+                total,
+            )
         for k in range(nz):
             for p in range(n):
                 out[b, k, y0 + p // width, x0 + p % width] = total[p, k]
@@ -298,9 +410,27 @@ def backproject_3d(
 
 @njit(**_OPTIONS)
 def spread_3d(
-    begin, end, kind, volume, cosines, sines, shifts, starts, x, y, z, sod, sdd, scale, row_scale, row_start, atan, out
+    begin,
+    end,
+    kind,
+    volume,
+    cosines,
+    sines,
+    shifts,
+    starts,
+    x,
+    y,
+    z,
+    sod,
+    sdd,
+    scale,
+    row_scale,
+    row_start,
+    atan,
+    out,
 ):
-    """Transpose of :func:`backproject_3d`: ``volume (B, Y, X, Z)`` into ``out (B, V, rows, columns)``."""
+    """Transpose of :func:`backproject_3d`: ``volume (B, Y, X, Z)`` into ``out (B, V, rows,
+    columns)``."""
     _, views, rows, columns = out.shape
     ny, nx, nz = volume.shape[1], volume.shape[2], volume.shape[3]
     number = volume.dtype.type
@@ -320,9 +450,22 @@ def spread_3d(
             for ix in range(nx):
                 line[ix] = y[iy]
             _positions_3d(
-                kind, x, line, cosines[v], sines[v], shifts[v, 0], shifts[v, 1], sod, sdd, scale, starts[v], atan,
-                index, weight, height,
-            )  # fmt: skip
+                kind,
+                x,
+                line,
+                cosines[v],
+                sines[v],
+                shifts[v, 0],
+                shifts[v, 1],
+                sod,
+                sdd,
+                scale,
+                starts[v],
+                atan,
+                index,
+                weight,
+                height,
+            )
             for ix in range(nx):
                 position = min(max(index[ix], 0.0), last)
                 left = np.uint64(int(position))

@@ -1,5 +1,6 @@
-"""Does the scan see what is to be reconstructed, and agree with itself? FBP itself never fails: without data it
-extrapolates, plausibly, and a wrong rotation centre it draws as sharp double edges."""
+"""Does the scan see what is to be reconstructed, and agree with itself? FBP itself never fails:
+without data it extrapolates, plausibly, and a wrong rotation centre it draws as sharp double edges.
+"""
 
 from __future__ import annotations
 
@@ -22,34 +23,45 @@ from torchpcct.vector_geometry import VectorGeometry
 __all__ = ["check_rows", "consistency_warnings", "refuse_helix", "sampling_warnings", "view_notes"]
 
 STREAK_CELLS = 10.0
-"""Distance between the paths of neighbouring views at the border of the field of view, in cells at the axis, from which
-streaks of an object at the border are wider than what the kernels smooth. 1968 views of the paper's scanner: 1.6."""
+"""Distance between the paths of neighbouring views at the border of the field of view, in cells at
+the axis, from which streaks of an object at the border are wider than what the kernels smooth. 1968
+views of the paper's scanner: 1.6."""
 _CENTRE_MARGIN = 8
 """Columns beside a grid's footprint that the test of the rotation centre looks at."""
 
 
-_FEWEST_VIEWS, _FEWEST_CELLS = 24, 500
-_BLOCKS, _BLOCK_SIGMAS = 12, 2.0
+_FEWEST_VIEWS = 24
+_FEWEST_CELLS = 500
+_BLOCKS = 12
+_BLOCK_SIGMAS = 2.0
 _MOST_READINGS = 3_000_000
 _EVEN = 0.1
-"""Relative change over the views of what a row ends at, from which it is no air that is described too bright."""
-_SURROUND_TOLERANCE, _GAIN_TOLERANCE = 0.01, 0.004
-"""Relative deviation of the readings at a window's borders from its surround, and standard deviation of the gains of
-single cells, that are no finding."""
-_SHADOW, _ALIKE, _SOFT_MM, _BLACK, _OTHER_UNIT = 0.1, 0.7, 0.1, 5.0, (0.02, 0.25)
-"""Share of the highest line integral that is the object's shadow; of a row's that the next rows show, too; attenuation
-of water in mm⁻¹ of photons (18 keV) that pass no patient; line integral from which nothing passes; and share of it that
-a unit's factor of ten leaves."""
+"""Relative change over the views of what a row ends at, from which it is no air that is
+described too bright."""
+_SURROUND_TOLERANCE = 0.01
+_GAIN_TOLERANCE = 0.004
+"""Relative deviation of the readings at a window's borders from its surround, and standard
+deviation of the gains of single cells, that are no finding."""
+_SHADOW = 0.1
+_ALIKE = 0.7
+_SOFT_MM = 0.1
+_BLACK = 5.0
+_OTHER_UNIT = (0.02, 0.25)
+"""Share of the highest line integral that is the object's shadow; of a row's that the next rows
+show, too; attenuation of water in mm⁻¹ of photons (18 keV) that pass no patient; line integral from
+which nothing passes; and share of it that a unit's factor of ten leaves."""
 _BORDER = 2
 """Columns at either border of a window that are compared with the surround."""
-_STEADY, _TRAVEL = 0.98, 0.25
-"""A motion along z that a straight line explains to this share of its variance, by more than this share of the height
-that the rows cover at the axis, is a table's travel."""
+_STEADY = 0.98
+_TRAVEL = 0.25
+"""A motion along z that a straight line explains to this share of its variance, by more than this
+share of the height that the rows cover at the axis, is a table's travel."""
 
 
 @checked
 def refuse_helix(geometry: Geometry, motion: Any) -> None:
-    """Raise ``ValueError`` for a motion that makes a cone beam's circle a helix, which FDK cannot reconstruct.
+    """Raise ``ValueError`` for a motion that makes a cone beam's circle a helix, which FDK cannot
+    reconstruct.
 
     Args:
         geometry: of the scan.
@@ -63,14 +75,17 @@ def refuse_helix(geometry: Geometry, motion: Any) -> None:
         return
     if np.corrcoef(z, geometry.angles)[0, 1] ** 2 > _STEADY:
         raise ValueError(
-            f"the table travels by {np.ptp(z):.2f} mm, the rows cover {height:.2f} mm at the axis: filtered "
-            "backprojection of a helix is not provided. Use recon.pwls with Projector(geometry, grid, motion=motion)"
+            f"the table travels by {np.ptp(z):.2f} mm, the rows cover {height:.2f} mm at the "
+            "axis: filtered "
+            "backprojection of a helix is not provided. Use recon.pwls with Projector(geometry, "
+            "grid, motion=motion)"
         )
 
 
 @checked
 def check_rows(geometry: Geometry, grid: VolumeGrid, motion: Any = None) -> list[str]:
-    """Refuse a grid that no view of a cone beam sees; say which slices are not seen by all views, or by none.
+    """Refuse a grid that no view of a cone beam sees; say which slices are not seen by all views,
+    or by none.
 
     Args:
         geometry: parallel and fan beams have no rows, and pass.
@@ -85,27 +100,47 @@ def check_rows(geometry: Geometry, grid: VolumeGrid, motion: Any = None) -> list
     """
     if not isinstance(geometry, ConeBeam) or grid.ndim != 3:
         return []
-    shift = np.zeros((1, 3)) if motion is None else np.asarray(motion, dtype=np.float64).reshape(-1, 3)
+    shift = (
+        np.zeros((1, 3)) if motion is None else np.asarray(motion, dtype=np.float64).reshape(-1, 3)
+    )
     half = geometry.pitch[0] / 2
     bottom, top = geometry.row_positions[0] - half, geometry.row_positions[-1] + half
-    # The grid's nearest and farthest voxels from the source over the turn: their rows are the highest and the lowest.
-    radius = min(grid.in_plane_radius + float(np.hypot(shift[:, 1], shift[:, 2]).max()), 0.999 * geometry.sod)
+    # The grid's nearest and farthest voxels from the source over the turn: their rows are the
+    # highest and the lowest.
+    radius = min(
+        grid.in_plane_radius + float(np.hypot(shift[:, 1], shift[:, 2]).max()), 0.999 * geometry.sod
+    )
     inner = max(float(np.hypot(*grid.center[1:])) - math.hypot(*grid.extent[1:]) / 2, 0.0)
-    heights = geometry.sdd / np.array([geometry.sod - radius, geometry.sod + radius, geometry.sod - inner])
+    heights = geometry.sdd / np.array(
+        [geometry.sod - radius, geometry.sod + radius, geometry.sod - inner]
+    )
     z = grid.axes[0]
     low, high = z + shift[:, 0].min(), z + shift[:, 0].max()
     margin = 1e-6 * geometry.pitch[0]
-    by_all = (np.outer(heights, high).max(0) <= top + margin) & (np.outer(heights, low).min(0) >= bottom - margin)
-    by_some = (np.outer(heights, low).min(0) <= top + margin) & (np.outer(heights, high).max(0) >= bottom - margin)
-    reach = f"the {geometry.rows} rows cover z = {bottom / heights[2]:.2f} … {top / heights[2]:.2f} mm at the grid"
+    by_all = (np.outer(heights, high).max(0) <= top + margin) & (
+        np.outer(heights, low).min(0) >= bottom - margin
+    )
+    by_some = (np.outer(heights, low).min(0) <= top + margin) & (
+        np.outer(heights, high).max(0) >= bottom - margin
+    )
+    reach = (
+        f"the {geometry.rows} rows cover z = {bottom / heights[2]:.2f} … "
+        f"{top / heights[2]:.2f} mm at the grid"
+    )
     if not by_some.any():
-        raise ValueError(f"the grid (z = {z[0]:g} … {z[-1]:g} mm) is seen in no view: {reach}; move it along z")
+        raise ValueError(
+            f"the grid (z = {z[0]:g} … {z[-1]:g} mm) is seen in no view: {reach}; move it along z"
+        )
     found = []
-    for seen, how in ((by_some, "are seen in no view"), (by_all | ~by_some, "are not seen in every view")):
+    for seen, how in (
+        (by_some, "are seen in no view"),
+        (by_all | ~by_some, "are not seen in every view"),
+    ):
         if not seen.all():
             out = z[~seen]
             found.append(
-                f"{out.size} of {z.size} slices (z = {out.min():g} … {out.max():g} mm) {how} and are extrapolated: "
+                f"{out.size} of {z.size} slices (z = {out.min():g} … {out.max():g} mm) {how} and "
+                "are extrapolated: "
                 f"{reach}"
             )
     return found
@@ -113,20 +148,27 @@ def check_rows(geometry: Geometry, grid: VolumeGrid, motion: Any = None) -> list
 
 @checked
 def view_notes(geometry: Geometry) -> list[str]:
-    """What is unusual about the views and right nevertheless: both ends of a turn, or half a turn, among them.
+    """What is unusual about the views and right nevertheless: both ends of a turn, or half a turn,
+    among them.
 
     Args:
         geometry: of the scan, views in the order in which they were taken.
     """
     first, last = float(geometry.angles[0]), float(geometry.angles[-1])
-    turn = math.pi if isinstance(geometry, ParallelBeam) and abs(last - first) < 1.5 * math.pi else 2.0 * math.pi
+    turn = (
+        math.pi
+        if isinstance(geometry, ParallelBeam) and abs(last - first) < 1.5 * math.pi
+        else 2.0 * math.pi
+    )
     beyond = abs(abs(last - first) - turn)
     if geometry.views < 3 or beyond > SAME_VIEW * turn / geometry.views:
         return []
     how = ", mirrored" if turn < 4.0 else ""
     return [
-        f"the views reach from {math.degrees(first):.5g}° to {math.degrees(last):.5g}°, both ends included: the last "
-        f"repeats the first{how}, and the two share one step of {math.degrees(view_step(geometry.angles)):.3g}°"
+        f"the views reach from {math.degrees(first):.5g}° to {math.degrees(last):.5g}°, both ends "
+        "included: the last "
+        f"repeats the first{how}, and the two share one step of "
+        f"{math.degrees(view_step(geometry.angles)):.3g}°"
     ]
 
 
@@ -144,14 +186,19 @@ def sampling_warnings(geometry: Geometry) -> list[str]:
         cell, radius = geometry.pitch, float(np.abs(geometry.column_positions).max())
     else:
         g: Any = geometry
-        cell, radius = (g.pitch[1] if isinstance(g, ConeBeam) else g.pitch) / g.magnification, g.fov_radius
+        cell, radius = (
+            (g.pitch[1] if isinstance(g, ConeBeam) else g.pitch) / g.magnification,
+            g.fov_radius,
+        )
     apart = view_step(geometry.angles) * radius
     if apart <= STREAK_CELLS * cell:
         return []
     needed = math.ceil(2 * math.pi * radius / (STREAK_CELLS * cell))
     return [
-        f"{geometry.views} views are few: at the border of the field of view ({radius:.0f} mm) the paths of "
-        f"neighbouring views lie {apart:.1f} mm apart, {apart / cell:.0f} cells: edges there draw streaks; "
+        f"{geometry.views} views are few: at the border of the field of view ({radius:.0f} mm) "
+        "the paths of "
+        f"neighbouring views lie {apart:.1f} mm apart, {apart / cell:.0f} cells: edges there draw "
+        "streaks; "
         f"{needed} views a turn would keep them below {STREAK_CELLS:g} cells"
     ]
 
@@ -160,13 +207,16 @@ def sampling_warnings(geometry: Geometry) -> list[str]:
 def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
     """Whether a scan contradicts itself or its description, whatever reconstructs it.
 
-    Neighbouring views (:mod:`torchpcct.checks.neighbours`: order, missing, stuck, travel) and columns
-    (:mod:`torchpcct.checks.columns`: gains, places); opposite rays (:mod:`torchpcct.checks.opposite_rays`); where they
-    agree, the moments of the views (:mod:`torchpcct.checks.moments`: no line integrals, motion) of a whole field; rows
-    that end inside the object; and of a window whether its borders see the surround, and its cells have one gain.
+    Neighbouring views (:mod:`torchpcct.checks.neighbours`: order, missing, stuck, travel) and
+    columns (:mod:`torchpcct.checks.columns`: gains, places); opposite rays
+    (:mod:`torchpcct.checks.opposite_rays`); where they agree, the moments of the views
+    (:mod:`torchpcct.checks.moments`: no line integrals, motion) of a whole field; rows that end
+    inside the object; and of a window whether its borders see the surround, and its cells have one
+    gain.
 
     Args:
-        scan: counting or energy integrating, without energy bins; of several slices the middle one is looked at.
+        scan: counting or energy integrating, without energy bins; of several slices the middle one
+            is looked at.
         grid: what is reconstructed.
 
     Returns:
@@ -179,7 +229,10 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
 
     whole, window, about = scan, scan.window, (0.0, 0.0)
     if window is not None:
-        window, about = footprint(scan.geometry, grid, margin=_CENTRE_MARGIN).within(window), tuple(grid.center[-2:])
+        window, about = (
+            footprint(scan.geometry, grid, margin=_CENTRE_MARGIN).within(window),
+            tuple(grid.center[-2:]),
+        )
         scan = scan.crop(window)
     lines, geometry = scan.line_integrals(), scan.geometry
     if isinstance(geometry, VectorGeometry):
@@ -198,7 +251,8 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
         return [*_surround_texts(_thinned_out(whole)), *opposite.findings]
     order = neighbour_test(lines, geometry)
     columns = list(column_test(lines, geometry).findings)
-    if order.findings and "jump" not in order.sizes:  # in no order at all: opposite rays and moments are, too
+    # in no order at all: opposite rays and moments are, too
+    if order.findings and "jump" not in order.sizes:
         return [*order.findings, *columns]
     opposite = geometry_test(lines, geometry)
     found = [*_stuck_texts(scan, geometry), *order.findings, *opposite.findings]
@@ -218,13 +272,18 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
 
 
 def _water_texts(lines: Any, geometry: Any, mu_water: float) -> list[str]:
-    """Water that would be black as thick as the object is, which lets ten times less than its line integrals through:
-    ``mu_water`` is of another unit. Of other errors of ``mu_water`` no data can tell."""
+    """Water that would be black as thick as the object is, which lets ten times less than its line
+    integrals through: ``mu_water`` is of another unit. Of other errors of ``mu_water`` no data can
+    tell."""
     p = lines.reshape(geometry.views, -1, geometry.columns).double().numpy()
     densest = p.max((0, 2))
     # Of what is thinner than a row no thickness is known.
     beside = np.minimum(densest[:-2], densest[2:]) if len(densest) > 2 else densest[:0]
-    alike = np.flatnonzero(beside > _ALIKE * densest[1:-1]) + 1 if len(densest) > 1 else np.zeros(1, np.int64)
+    alike = (
+        np.flatnonzero(beside > _ALIKE * densest[1:-1]) + 1
+        if len(densest) > 1
+        else np.zeros(1, np.int64)
+    )
     if mu_water < _SOFT_MM or not alike.size:
         return []
     row = int(alike[np.argmax(densest[alike])])
@@ -236,8 +295,10 @@ def _water_texts(lines: Any, geometry: Any, mu_water: float) -> list[str]:
     if black < _BLACK or not _OTHER_UNIT[0] * black < found < _OTHER_UNIT[1] * black:
         return []
     return [
-        f"water of mu_water = {mu_water:.3g} mm⁻¹ as thick as the object ({across:.3g} mm) would have a line integral "
-        f"of {black:.2g}, the densest here is {found:.2g}: all reads about {1000 * (found / black - 1):.0f} HU; is "
+        f"water of mu_water = {mu_water:.3g} mm⁻¹ as thick as the object ({across:.3g} mm) would "
+        "have a line integral "
+        f"of {black:.2g}, the densest here is {found:.2g}: all reads about "
+        f"{1000 * (found / black - 1):.0f} HU; is "
         f"mu_water given in cm⁻¹? {mu_water:.3g} cm⁻¹ are {mu_water / 10:.3g} mm⁻¹"
     ]
 
@@ -253,44 +314,54 @@ def _stuck_texts(scan: Scan, geometry: Geometry) -> list[str]:
 
 
 def _thinned_out(scan: Scan) -> Scan:
-    """Every n-th view of a windowed scan, so that a test of it costs little beside its reconstruction."""
+    """Every n-th view of a windowed scan, so that a test of it costs little beside its
+    reconstruction."""
     stride = math.ceil(scan.counts.numel() / _MOST_READINGS)
     return scan if stride == 1 or scan.counts.ndim != 3 else scan.select(slice(None, None, stride))
 
 
 def _surround_texts(scan: Scan) -> list[str]:
-    """Whether a window's borders, which see next to nothing of the inset, read what the known surround says; and
-    whether cells deviate from those in the rows beside them in the views of even and of odd number alike, as gains do
-    and noise does not."""
+    """Whether a window's borders, which see next to nothing of the inset, read what the known
+    surround says; and whether cells deviate from those in the rows beside them in the views of even
+    and of odd number alike, as gains do and noise does not."""
     window = scan.window
     assert window is not None
     lines = (scan.line_integrals() - window.take(scan.surround_line_integrals())).double()
     if lines.ndim != 3 or lines.shape[-1] < 4 * _BORDER or lines.shape[0] < _FEWEST_VIEWS:
         return []
     found = []
-    # What stands at the rim of the inset is at one border at a time, not at both over a third of the turn.
+    # What stands at the rim of the inset is at one border at a time, not at both over a third of
+    # the turn.
     off = [_border_deviation(scan, part) for part in (slice(_BORDER), slice(-_BORDER, None))]
     for sign, side in ((1.0, "above"), (-1.0, "below")):
-        least = min(float(np.quantile(sign * ratio - _BLOCK_SIGMAS * error, 0.7)) for ratio, error in off)
+        least = min(
+            float(np.quantile(sign * ratio - _BLOCK_SIGMAS * error, 0.7)) for ratio, error in off
+        )
         if least > _SURROUND_TOLERANCE:
             size = 100.0 * np.mean([np.quantile(sign * ratio, 0.7) for ratio, _ in off])
             found.append(
-                f"beside the inset the readings of a third of the views or more lie {size:.2g} % {side} those of the "
-                "known surround: they hold something else than the transmission (a dark signal, scatter, pile-up, "
-                "saturation), or exposure or surround are not those of the scan; values are off by a smooth background"
+                f"beside the inset the readings of a third of the views or more lie {size:.2g} % "
+                f"{side} those of the "
+                "known surround: they hold something else than the transmission (a dark signal, "
+                "scatter, pile-up, "
+                "saturation), or exposure or surround are not those of the scan; values are off "
+                "by a smooth background"
             )
     gain = _gain_spread(lines, window.column_indices)
     if gain > _GAIN_TOLERANCE:
         found.append(
-            f"the cells of the detector differ from their neighbours in the next rows by {100 * gain:.2g} % in all "
-            "their views (standard deviation): gains that the calibration in air did not see, which draw rings"
+            "the cells of the detector differ from their neighbours in the next rows by "
+            f"{100 * gain:.2g} % in all "
+            "their views (standard deviation): gains that the calibration in air did not see, "
+            "which draw rings"
         )
     return found
 
 
 def _border_deviation(scan: Scan, part: slice) -> tuple[Any, Any]:
-    """Relative deviation of the columns ``part`` of a window from the surround in blocks of views, and its standard
-    error from the scatter of the views: ratios of sums, which have no bias of a logarithm."""
+    """Relative deviation of the columns ``part`` of a window from the surround in blocks of views,
+    and its standard error from the scatter of the views: ratios of sums, which have no bias of a
+    logarithm."""
     assert scan.window is not None
     assert scan.surround is not None
     expected = scan.window.take(scan.surround)[..., part].double()
@@ -302,12 +373,16 @@ def _border_deviation(scan: Scan, part: slice) -> tuple[Any, Any]:
     views = [(values * sound).sum((1, 2)).numpy() for values in (read, expected)]
     blocks = np.array_split(np.arange(len(read)), _BLOCKS)
     ratios = [views[0][k].sum() / max(views[1][k].sum(), 1e-9) - 1.0 for k in blocks]
-    errors = [np.std(views[0][k] / np.maximum(views[1][k], 1e-9)) / math.sqrt(max(k.size - 1, 1)) for k in blocks]
+    errors = [
+        np.std(views[0][k] / np.maximum(views[1][k], 1e-9)) / math.sqrt(max(k.size - 1, 1))
+        for k in blocks
+    ]
     return np.array(ratios), np.array(errors)
 
 
 def _gain_spread(lines: Any, columns: Any) -> float:
-    """Standard deviation of the cells' gains, less 4 standard errors; 0 where there are too few rows.
+    """Standard deviation of the cells' gains, less 4 standard errors; 0 where there are too few
+    rows.
 
     Args:
         lines: ``(views, rows, columns)`` of a window.
@@ -321,9 +396,13 @@ def _gain_spread(lines: Any, columns: Any) -> float:
     for part in (slice(0, None, 2), slice(1, None, 2)):
         at = (columns[part] - low).ravel()
         counts.append(np.bincount(at, minlength=width))
-        means.append(np.stack([np.bincount(at, row[part].ravel(), width) for row in bend]) / np.maximum(counts[-1], 1))
+        means.append(
+            np.stack([np.bincount(at, row[part].ravel(), width) for row in bend])
+            / np.maximum(counts[-1], 1)
+        )
     often = (counts[0] > 0) & (counts[1] > 0)
-    # Independent noise, the same gains: the mean product is the variance of the gains, times 1 + 2 / 4 for the bend.
+    # Independent noise, the same gains: the mean product is the variance of the gains, times 1 + 2
+    # / 4 for the bend.
     product = (means[0] * means[1])[:, often]
     if product.size < _FEWEST_CELLS:
         return 0.0
@@ -334,17 +413,25 @@ def _gain_spread(lines: Any, columns: Any) -> float:
 
 
 def _cut_text(lines: Any, sides: tuple[bool, bool]) -> str:
-    ends = [lines[..., k].reshape(lines.shape[0], -1).mean(1) for k, cut in ((0, sides[0]), (-1, sides[1])) if cut]
+    ends = [
+        lines[..., k].reshape(lines.shape[0], -1).mean(1)
+        for k, cut in ((0, sides[0]), (-1, sides[1]))
+        if cut
+    ]
     level = max(float(end.mean()) for end in ends)
     if all(sides) and all(float(end.std()) < _EVEN * level for end in ends):
         return (
-            f"no row ends in air: its line integrals are {level:.2g} at both ends in all views alike: air is "
-            f"{math.exp(level):.2g} times too bright (measured with another exposure or gain, or readings saturate), "
+            f"no row ends in air: its line integrals are {level:.2g} at both ends in all views "
+            "alike: air is "
+            f"{math.exp(level):.2g} times too bright (measured with another exposure or gain, or "
+            "readings saturate), "
             "or the object reaches beyond the detector all around"
         )
     where = " and the ".join(name for name, cut in (("first", sides[0]), ("last", sides[1])) if cut)
     return (
-        f"the rows end inside the object at the {where} column (line integrals of {level:.2g} on average there): what "
-        "lies beyond is not known, so values are off by a smooth background, most near the edge of the field of view; "
+        f"the rows end inside the object at the {where} column (line integrals of {level:.2g} on "
+        "average there): what "
+        "lies beyond is not known, so values are off by a smooth background, most near the edge "
+        "of the field of view; "
         "differences between neighbours are not"
     )

@@ -1,8 +1,10 @@
-"""What a detector does not show: the short side of an offset one, and objects that reach beyond its edges.
+"""What a detector does not show: the short side of an offset one, and objects that reach beyond its
+edges.
 
-The ramp filter needs whole rows. Where a row ends inside the object, it is continued by the chords of a cylinder that
-fits its last readings in value and slope (Hsieh et al., Med. Phys. 31, 2385, 2004). Where the rows of an offset
-detector end early, redundancy weights have taken them to zero (Wang 2002), and zeros follow.
+The ramp filter needs whole rows. Where a row ends inside the object, it is continued by the chords
+of a cylinder that fits its last readings in value and slope (Hsieh et al., Med. Phys. 31, 2385,
+2004). Where the rows of an offset detector end early, redundancy weights have taken them to zero
+(Wang 2002), and zeros follow.
 """
 
 from __future__ import annotations
@@ -26,8 +28,10 @@ __all__ = ["Rows", "continued", "cut_off", "ends_cut_off", "mirrored", "reach", 
 Floats = NDArray[np.float64]
 G = TypeVar("G", bound=Geometry)
 
-_CUT, _CUT_VIEWS = 0.03, 0.05
-"""Rows are cut off if their end exceeds a share of the highest line integral in more than a share of the views."""
+_CUT = 0.03
+_CUT_VIEWS = 0.05
+"""Rows are cut off if their end exceeds a share of the highest line integral in more than a
+share of the views."""
 _CUT_RANGES = 40
 _LEFT_OUT = 0.1
 _FEWEST_COLUMNS = 4
@@ -64,19 +68,26 @@ def cut_off(lines: Tensor, geometry: Any, weights: Floats) -> tuple[bool, bool]:
     A side that the weights leave out (the short one of an offset detector) does not count.
     """
     means = lines.detach()
-    return ends_cut_off(*row_ends(means.mean(-2) if isinstance(geometry, ConeBeam) else means), geometry, weights)
+    return ends_cut_off(
+        *row_ends(means.mean(-2) if isinstance(geometry, ConeBeam) else means), geometry, weights
+    )
 
 
 def row_ends(means: Tensor) -> tuple[float, Tensor, Tensor]:
-    """The highest of line integrals ``(..., views, columns)``, means over the rows, and what the rows end at."""
+    """The highest of line integrals ``(..., views, columns)``, means over the rows, and what the
+    rows end at."""
     width = max(1, means.shape[-1] // 256)
     return float(means.amax()), means[..., :width].mean(-1), means[..., -width:].mean(-1)
 
 
-def ends_cut_off(highest: float, first: Tensor, last: Tensor, geometry: Any, weights: Floats) -> tuple[bool, bool]:
+def ends_cut_off(
+    highest: float, first: Tensor, last: Tensor, geometry: Any, weights: Floats
+) -> tuple[bool, bool]:
     """:func:`cut_off` of what :func:`row_ends` says of a scan."""
     limit = _CUT * highest
-    order = torch.from_numpy(np.argsort(np.mod(geometry.angles, 2.0 * math.pi), kind="stable")).to(first.device)
+    order = torch.from_numpy(np.argsort(np.mod(geometry.angles, 2.0 * math.pi), kind="stable")).to(
+        first.device
+    )
     found = [limit > 0 and _rises(end[..., order], limit) for end in (first, last)]
     if _leaves_out_short_side(weights, geometry):
         shown = weights.sum(0)
@@ -85,7 +96,8 @@ def ends_cut_off(highest: float, first: Tensor, last: Tensor, geometry: Any, wei
 
 
 def _leaves_out_short_side(weights: Floats, geometry: Any) -> bool:
-    """Whether these are the weights of a full turn of an offset detector; a short scan needs both sides."""
+    """Whether these are the weights of a full turn of an offset detector; a short scan needs
+    both sides."""
     if weights.shape[1] == 1 or not is_offset(geometry):
         return False
     ends = sorted((float(weights[:, 0].sum()), float(weights[:, -1].sum())))
@@ -93,17 +105,20 @@ def _leaves_out_short_side(weights: Floats, geometry: Any) -> bool:
 
 
 def _rises(end: Tensor, limit: float) -> bool:
-    """Whether ``end (..., views)`` lies above a limit in more than :data:`_CUT_VIEWS` of the views, noise set aside.
+    """Whether ``end (..., views)`` lies above a limit in more than :data:`_CUT_VIEWS` of the views,
+    noise set aside.
 
-    An object is cut off over ranges of views; noise is not: means over a fortieth of the turn are compared, with a
-    margin of three of their standard errors.
+    An object is cut off over ranges of views; noise is not: means over a fortieth of the turn are
+    compared, with a margin of three of their standard errors.
     """
     series = end.reshape(-1, 1, end.shape[-1]).double()
     width = max(1, series.shape[-1] // _CUT_RANGES)
     smooth = torch.nn.functional.avg_pool1d(series, width, 1)
     margin = 0.0
     if series.shape[-1] > 2:
-        margin = 3.0 * float(series.diff(dim=-1).abs().median()) * MEDIAN_TO_SD / math.sqrt(2.0 * width)
+        margin = (
+            3.0 * float(series.diff(dim=-1).abs().median()) * MEDIAN_TO_SD / math.sqrt(2.0 * width)
+        )
     return float((smooth > limit + margin).double().mean()) > _CUT_VIEWS
 
 
@@ -118,7 +133,8 @@ def _wider(geometry: G, before: int, behind: int) -> G:
 
 
 def _room(geometry: Any) -> tuple[int, int]:
-    """Columns that fit before the first and behind the last one, as many as the detector has at most."""
+    """Columns that fit before the first and behind the last one, as many as the detector has at
+    most."""
     u, n = geometry.column_positions, geometry.columns
     if isinstance(geometry, ParallelBeam):
         return n, n
@@ -131,7 +147,8 @@ def _room(geometry: Any) -> tuple[int, int]:
 def mirrored(rows: Rows, grid: VolumeGrid, travel: float = 0.0) -> Rows:
     """The rows of an offset detector with zeros on the short side, where the grid needs them.
 
-    Filtered rows do not end with the readings: a voxel beyond the short side reads the filter's tail there.
+    Filtered rows do not end with the readings: a voxel beyond the short side reads the filter's
+    tail there.
     """
     g = rows.geometry
     if not _leaves_out_short_side(rows.weights, g):
@@ -171,7 +188,11 @@ def continued(rows: Rows, sides: tuple[bool, bool], outside: float) -> Rows:
         if not space:
             continue
         first = room[0]
-        near = slice(first, first + fit) if side == 0 else slice(first + g.columns - fit, first + g.columns)
+        near = (
+            slice(first, first + fit)
+            if side == 0
+            else slice(first + g.columns - fit, first + g.columns)
+        )
         far = slice(0, space) if side == 0 else slice(first + g.columns, None)
         end = g.column_positions[0 if side == 0 else -1]
         away = 1.0 if not cone else (g.sdd if g.detector == "curved" else math.hypot(g.sdd, end))
@@ -187,10 +208,12 @@ def continued(rows: Rows, sides: tuple[bool, bool], outside: float) -> Rows:
 
 
 def _cylinder(last: Tensor, near: Floats, far: Floats, mu: Any) -> Tensor:
-    """Chords at ``far`` of the cylinder that fits the readings ``last (..., [rows,] fit)`` at ``near`` best.
+    """Chords at ``far`` of the cylinder that fits the readings ``last (..., [rows,] fit)`` at
+    ``near`` best.
 
-    With the chord p = 2 μ √(R² − (t − t₀)²), p² / (4 μ²) + t² is a straight line in t: a linear fit. It is exact for
-    parallel rays, and for cylinders on the axis of a fan; a fan's rays see another t₀ each, a little.
+    With the chord p = 2 μ √(R² − (t − t₀)²), p² / (4 μ²) + t² is a straight line in t: a linear
+    fit. It is exact for parallel rays, and for cylinders on the axis of a fan; a fan's rays see
+    another t₀ each, a little.
     """
     number: dict[str, Any] = {"dtype": torch.float64, "device": last.device}
     double = torch.as_tensor(2.0 * np.asarray(mu), **number)
@@ -204,8 +227,11 @@ def _cylinder(last: Tensor, near: Floats, far: Floats, mu: Any) -> Tensor:
     def chord(at: Tensor) -> Tensor:
         return double * (level + slope * at - at * at).clamp(min=0).sqrt()
 
-    # Rows that do end in air before the edge are not continued: the fit must meet the outermost readings.
+    # Rows that do end in air before the edge are not continued: the fit must meet the outermost
+    # readings.
     end = torch.argsort((t - u.mean()).abs())[:3]
     fitted = chord(t[end]).mean(-1, keepdim=True)
-    share = last.double()[..., end].mean(-1, keepdim=True) / fitted.clamp(min=torch.finfo(torch.float64).tiny)
+    share = last.double()[..., end].mean(-1, keepdim=True) / fitted.clamp(
+        min=torch.finfo(torch.float64).tiny
+    )
     return (chord(u) * share.clamp(0.0, 1.0)).to(last.dtype)

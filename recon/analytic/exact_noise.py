@@ -1,11 +1,13 @@
-"""The exact covariance of ROI means after FBP, and the ROI means of noisy scans without reconstructing them.
+"""The exact covariance of ROI means after FBP, and the ROI means of noisy scans without
+reconstructing them.
 
-FBP is linear, so an ROI mean is one inner product h·y of the line integrals with h = filterᵀ backprojectionᵀ w: one
-adjoint pass per ROI. The readings are independent, so Cov(h₁·y, h₂·y) = Σ_i h₁ᵢ h₂ᵢ Var(yᵢ) with
-Var(yᵢ) = slope² · Var(reading) / reading² (delta method, slope of the water correction;
-:meth:`torchpcct.scan.Scan.relative_variance` for counts and for energy-integrating signals). It holds for any number
-of photons at which the logarithm is nearly linear. The same h gives the ROI means of any realisation: a scan costs one
-pass over the few readings that the ROI sees instead of a reconstruction per kernel and voxel size.
+FBP is linear, so an ROI mean is one inner product h·y of the line integrals with h = filterᵀ
+backprojectionᵀ w: one adjoint pass per ROI. The readings are independent, so Cov(h₁·y, h₂·y) = Σ_i
+h₁ᵢ h₂ᵢ Var(yᵢ) with Var(yᵢ) = slope² · Var(reading) / reading² (delta method, slope of the water
+correction; :meth:`torchpcct.scan.Scan.relative_variance` for counts and for energy-integrating
+signals). It holds for any number of photons at which the logarithm is nearly linear. The same h
+gives the ROI means of any realisation: a scan costs one pass over the few readings that the ROI
+sees instead of a reconstruction per kernel and voxel size.
 """
 
 from __future__ import annotations
@@ -39,17 +41,18 @@ __all__ = [
 ]
 
 FILTER_MARGIN_COLUMNS = 32
-"""Columns on either side of the footprint whose noise is counted. The filter's tail falls as 1 / n², its square as
-1 / n⁴: what lies beyond adds less than 1e-4 to the variance of an ROI mean."""
+"""Columns on either side of the footprint whose noise is counted. The filter's tail falls as 1 /
+n², its square as 1 / n⁴: what lies beyond adds less than 1e-4 to the variance of an ROI mean."""
 
 
 @checked
 def line_integral_variance(clean: Scan, exposure_s: float) -> Tensor:
-    """Variance of the water-linearised line integrals of a noise-free scan at an exposure, shape of ``clean.counts``.
+    """Variance of the water-linearised line integrals of a noise-free scan at an exposure, shape of
+    ``clean.counts``.
 
     Raises:
-        ValueError: the scan is noisy (its expectations are needed); ``exposure_s`` ≤ 0; an energy-integrating scan that
-            does not hold the energy of its quanta.
+        ValueError: the scan is noisy (its expectations are needed); ``exposure_s`` ≤ 0; an
+            energy-integrating scan that does not hold the energy of its quanta.
     """
     variance = clean.relative_variance(exposure_s)
     p = clean.counts.log().neg_().add_(clean._at_window(clean.air.log()))
@@ -63,7 +66,8 @@ class RoiAdjoints:
 
     Attributes:
         window: the readings that the ROIs see.
-        vectors: for every grid ``(kernels, rois, views, rows, columns)`` on ``window``: h in HU, float32.
+        vectors: for every grid ``(kernels, rois, views, rows, columns)`` on ``window``: h in HU,
+            float32.
     """
 
     window: DetectorWindow
@@ -71,23 +75,27 @@ class RoiAdjoints:
 
     @property
     def matrix(self) -> Tensor:
-        """All vectors as rows, ``(grids · kernels · rois, readings)``: the grid varies slowest, the ROI fastest."""
+        """All vectors as rows, ``(grids · kernels · rois, readings)``: the grid varies slowest,
+        the ROI fastest."""
         return torch.cat([v.flatten(0, 1).flatten(1) for v in self.vectors])
 
     def joint_covariance(self, clean: Scan, exposure_s: float) -> NDArray[np.float64]:
-        """Covariance in HU² of all ROI means with each other, ``(M, M)``, ordered as the rows of :attr:`matrix`.
+        """Covariance in HU² of all ROI means with each other, ``(M, M)``, ordered as the rows of
+        :attr:`matrix`.
 
         Args:
             clean: the noise-free windowed scan.
             exposure_s: exposure in s.
 
         Raises:
-            ValueError: a scan that is noisy or not windowed, or whose window does not hold the ROIs' readings.
+            ValueError: a scan that is noisy or not windowed, or whose window does not hold the
+                ROIs' readings.
         """
         return self.covariance_of(line_integral_variance(clean.crop(self.window), exposure_s))
 
     def covariance_of(self, variance: Tensor) -> NDArray[np.float64]:
-        """The same from the variances of the line integrals on ``window``, ``(views, rows, columns)``."""
+        """The same from the variances of the line integrals on ``window``, ``(views, rows,
+        columns)``."""
         rows = self.matrix.view(-1, variance.shape[0], variance[0].numel())
         total = np.zeros((rows.shape[0], rows.shape[0]))
         for view in range(rows.shape[1]):  # one view in float64 at a time: no copy of all vectors
@@ -116,7 +124,9 @@ def roi_adjoints(clean: Scan, fbp: InsetFbp, rois: Sequence[Sequence[RoiMean]]) 
     for start, trace in traces:
         padded = torch.zeros((*trace.shape[:2], rows, trace.shape[-1]), dtype=trace.dtype)
         padded[:, :, start - first : start - first + trace.shape[-2]] = trace
-        vectors.append(torch.stack(list(_filtered(fbp, padded, window, 1000.0 / fbp.linearisation.mu_ref))))
+        vectors.append(
+            torch.stack(list(_filtered(fbp, padded, window, 1000.0 / fbp.linearisation.mu_ref)))
+        )
     return RoiAdjoints(window, vectors)
 
 
@@ -130,7 +140,8 @@ def roi_covariance(
         clean: noise-free windowed scan.
         fbp: its grids and kernels.
         rois: for every grid of ``fbp``, the ROIs on that grid.
-        exposure_s: exposure; the covariance falls as its inverse (but for the share of electronic noise).
+        exposure_s: exposure; the covariance falls as its inverse (but for the share of electronic
+            noise).
 
     Returns:
         for every grid ``(kernels, rois, rois)``.
@@ -150,11 +161,15 @@ def roi_covariance(
 
 
 @checked
-def functional_covariance(fbp: InsetFbp, functionals: Tensor, ray_covariance: Tensor) -> NDArray[np.float64]:
-    """Exact covariance of linear functionals of two channels: one adjoint pass per functional, no Monte Carlo.
+def functional_covariance(
+    fbp: InsetFbp, functionals: Tensor, ray_covariance: Tensor
+) -> NDArray[np.float64]:
+    """Exact covariance of linear functionals of two channels: one adjoint pass per functional, no
+    Monte Carlo.
 
-    FBP is linear and rays are independent, so with h the adjoint of a functional's weights the covariance between
-    channel c of functional i and channel d of functional j is Σ_rays h_i h_j C_cd.
+    FBP is linear and rays are independent, so with h the adjoint of a functional's weights the
+    covariance between channel c of functional i and channel d of functional j is Σ_rays h_i h_j
+    C_cd.
 
     Args:
         fbp: of one grid with one kernel.
@@ -173,11 +188,16 @@ def functional_covariance(fbp: InsetFbp, functionals: Tensor, ray_covariance: Te
         raise ValueError("the noise of functionals needs a windowed scan: acquire it with region=")
     if tuple(ray_covariance.shape) != (3, w.views, w.rows, w.columns):
         raise ValueError(
-            f"ray_covariance must have the shape {(3, w.views, w.rows, w.columns)}, got {tuple(ray_covariance.shape)}"
+            f"ray_covariance must have the shape {(3, w.views, w.rows, w.columns)}, got "
+            f"{tuple(ray_covariance.shape)}"
         )
     if tuple(functionals.shape[1:]) != grid.shape:
-        raise ValueError(f"functionals must have the shape (n, *{grid.shape}), got {tuple(functionals.shape)}")
-    traces = BackprojectionPlan(fbp.geometry, grid, fbp.footprint).transpose(functionals.to(ray_covariance.dtype))
+        raise ValueError(
+            f"functionals must have the shape (n, *{grid.shape}), got {tuple(functionals.shape)}"
+        )
+    traces = BackprojectionPlan(fbp.geometry, grid, fbp.footprint).transpose(
+        functionals.to(ray_covariance.dtype)
+    )
     seen = w.with_rows(fbp.footprint.first_row, fbp.footprint.rows)
     (h,) = _filtered(fbp, traces, seen, 1.0)
     return np.stack([_gram(h, c) for c in w.crop(ray_covariance, seen)], axis=-1)
@@ -185,7 +205,8 @@ def functional_covariance(fbp: InsetFbp, functionals: Tensor, ray_covariance: Te
 
 @checked
 def voxel_covariance(clean: Scan, fbp: InsetFbp, exposure_s: float, voxel: Sequence[int]) -> Tensor:
-    """Exact covariance in HU² of one voxel with all voxels: one adjoint pass and one reconstruction.
+    """Exact covariance in HU² of one voxel with all voxels: one adjoint pass and one
+    reconstruction.
 
     Args:
         clean: noise-free windowed scan.
@@ -200,7 +221,9 @@ def voxel_covariance(clean: Scan, fbp: InsetFbp, exposure_s: float, voxel: Seque
         ValueError: several grids or kernels, a scan that is noisy or not windowed.
     """
     if len(fbp.grids) != 1 or len(fbp.kernels) != 1 or clean.window is None:
-        raise ValueError("the covariance of a voxel needs FBP of one grid with one kernel, and a windowed scan")
+        raise ValueError(
+            "the covariance of a voxel needs FBP of one grid with one kernel, and a windowed scan"
+        )
     (grid,), window = fbp.grids, clean.window
     variance = line_integral_variance(clean, exposure_s).to(torch.float32)
     hu = 1000.0 / fbp.linearisation.mu_ref
@@ -216,8 +239,11 @@ def voxel_covariance(clean: Scan, fbp: InsetFbp, exposure_s: float, voxel: Seque
         return reconstruct(h * variance)
 
 
-def _traces(fbp: InsetFbp, grid: VolumeGrid, rois: Sequence[RoiMean], clean: Scan) -> tuple[int, Tensor]:
-    """Transposed backprojection of ROI weights: first detector row, ``(rois, views, rows, columns)`` of those seen.
+def _traces(
+    fbp: InsetFbp, grid: VolumeGrid, rois: Sequence[RoiMean], clean: Scan
+) -> tuple[int, Tensor]:
+    """Transposed backprojection of ROI weights: first detector row, ``(rois, views, rows,
+    columns)`` of those seen.
 
     Filtering stays within a row, so the rows that no ROI sees are left out."""
     if clean.window is None:
@@ -236,8 +262,11 @@ def _near(fbp: InsetFbp, clean: Scan, first_row: int, rows: int) -> DetectorWind
     return near.with_rows(first_row, rows)
 
 
-def _filtered(fbp: InsetFbp, traces: Tensor, window: DetectorWindow, scale: float) -> Iterator[Tensor]:
-    """``scale`` times the adjoint vectors of every kernel, ``(rois, views, rows, columns)`` on ``window``."""
+def _filtered(
+    fbp: InsetFbp, traces: Tensor, window: DetectorWindow, scale: float
+) -> Iterator[Tensor]:
+    """``scale`` times the adjoint vectors of every kernel, ``(rois, views, rows, columns)`` on
+    ``window``."""
     traced = fbp.footprint.with_rows(window.first_row, window.rows)
     weights = angular_weights(fbp.geometry)
     for kernel in fbp.kernels:

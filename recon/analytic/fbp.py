@@ -38,7 +38,9 @@ _LOG = logging.getLogger(__name__)
 G = TypeVar("G", bound=Geometry)
 
 
-def _check_weights(weights: Any, geometry: Geometry, grid: VolumeGrid | None = None) -> NDArray[np.float64]:
+def _check_weights(
+    weights: Any, geometry: Geometry, grid: VolumeGrid | None = None
+) -> NDArray[np.float64]:
     if weights is None:
         return angular_weights(geometry, grid)
     w = reals("weights", weights)
@@ -46,7 +48,8 @@ def _check_weights(weights: Any, geometry: Geometry, grid: VolumeGrid | None = N
         w = w[:, None]
     if w.shape not in ((geometry.views, 1), (geometry.views, geometry.columns)):
         raise ValueError(
-            f"weights must have the shape ({geometry.views},) or ({geometry.views}, {geometry.columns}), got {w.shape}"
+            f"weights must have the shape ({geometry.views},) or ({geometry.views}, "
+            f"{geometry.columns}), got {w.shape}"
         )
     return w
 
@@ -63,34 +66,43 @@ def filter_sinogram(
 ) -> Tensor:
     """Weight and ramp-filter the rows of a scan: the first half of filtered backprojection.
 
-    The result carries the cosine, angular and redundancy weights, ready for :func:`backproject`. Filtering is linear:
-    after the scan of a background has been filtered once, the scan of a small inset or of other noise in its footprint
-    is filtered from that footprint alone (``held``). The result equals that of the whole rows to rounding.
+    The result carries the cosine, angular and redundancy weights, ready for :func:`backproject`.
+    Filtering is linear: after the scan of a background has been filtered once, the scan of a small
+    inset or of other noise in its footprint is filtered from that footprint alone (``held``). The
+    result equals that of the whole rows to rounding.
 
     Args:
-        sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64. Data of another device are
-            filtered on the CPU and sent back.
+        sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64. Data of
+            another device are filtered on the CPU and sent back.
         geometry: parallel, fan or cone beam.
         kernel: reconstruction kernel (:data:`recon.names.KERNELS`) or a sequence of them.
-        window: return only these readings of every view (rows and columns); default: all. Its rows must be held.
+        window: return only these readings of every view (rows and columns); default: all. Its rows
+            must be held.
         held: the readings that ``sinogram`` holds, default: all; what is not held is zero.
         weights: angular weights ``(views,)`` or ``(views, columns)`` in rad that replace
             :func:`recon.analytic.angular_weights.angular_weights`.
 
     Returns:
-        ``(..., views, [rows,] columns)`` on the window, mm⁻¹; with a sequence of kernels a leading axis of kernels.
-        Differentiable to any order. Temporary memory is bounded by :data:`recon.analytic.filter_plan.CHUNK_BYTES` or
-        one view.
+        ``(..., views, [rows,] columns)`` on the window, mm⁻¹; with a sequence of kernels a leading
+        axis of kernels. Differentiable to any order. Temporary memory is bounded by
+        :data:`recon.analytic.filter_plan.CHUNK_BYTES` or one view.
 
     Raises:
-        ValueError: a wrong shape, an unknown kernel, a window beyond the detector, views that do not suffice.
+        ValueError: a wrong shape, an unknown kernel, a window beyond the detector, views that do
+            not suffice.
         TypeError: data that are not float32 or float64 tensors.
     """
     whole = DetectorWindow.full(geometry)
     held = whole if held is None else held
     check_data("sinogram", sinogram, data_shape(geometry, held))
     names, several = kernel_names(kernel)
-    plan = FilterPlan(geometry, names, _check_weights(weights, geometry), held, whole if window is None else window)
+    plan = FilterPlan(
+        geometry,
+        names,
+        _check_weights(weights, geometry),
+        held,
+        whole if window is None else window,
+    )
     flat = not isinstance(geometry, ConeBeam)
     given = (sinogram.unsqueeze(-2) if flat else sinogram).cpu()  # the kernels are CPU code
     out = apply_linear(given, plan.forward, plan.transpose).to(sinogram.device)
@@ -103,26 +115,29 @@ def filter_sinogram(
 def interleave(sinogram: Tensor, geometry: G) -> tuple[Tensor, G]:
     """Spread the columns over a detector of half the pitch, for scans with a quarter-column offset.
 
-    The opposite ray of a detector shifted by a quarter column falls between two columns. Filtering every view on a
-    grid of half the pitch, zeros between the readings, reaches up to twice the Nyquist frequency of one view; what one
-    view aliases there, its opposite cancels. The windows of :mod:`recon.analytic.ramp` then refer to the doubled
-    Nyquist frequency. Without the offset nothing cancels: details near the isocentre come out aliased.
+    The opposite ray of a detector shifted by a quarter column falls between two columns. Filtering
+    every view on a grid of half the pitch, zeros between the readings, reaches up to twice the
+    Nyquist frequency of one view; what one view aliases there, its opposite cancels. The windows of
+    :mod:`recon.analytic.ramp` then refer to the doubled Nyquist frequency. Without the offset
+    nothing cancels: details near the isocentre come out aliased.
 
-    The opposite of a ray falls between two views. What is aliased cancels where neighbouring views shift the object by
-    less than half a column: within pitch / (2 · view step) of the axis (of the paper's scan 78 mm, of one with 120
-    views 5 mm). Beyond, the two rays see different places, and the aliased details remain; a warning is logged if this
-    radius is less than a quarter of the field of view.
+    The opposite of a ray falls between two views. What is aliased cancels where neighbouring views
+    shift the object by less than half a column: within pitch / (2 · view step) of the axis (of the
+    paper's scan 78 mm, of one with 120 views 5 mm). Beyond, the two rays see different places, and
+    the aliased details remain; a warning is logged if this radius is less than a quarter of the
+    field of view.
 
     Args:
         sinogram: ``(..., columns)``.
-        geometry: parallel, fan or cone beam of a closed scan with an offset of about a quarter column.
+        geometry: parallel, fan or cone beam of a closed scan with an offset of about a quarter
+            column.
 
     Returns:
         ``(..., 2 · columns)`` and its geometry, for :func:`fbp`.
 
     Raises:
-        ValueError: a wrong shape; a scan that is not closed (half a turn suffices for parallel rays); columns without
-            the quarter offset (more than a tenth of a column from it).
+        ValueError: a wrong shape; a scan that is not closed (half a turn suffices for parallel
+            rays); columns without the quarter offset (more than a tenth of a column from it).
         TypeError: a wrong dtype.
     """
     check_data("sinogram", sinogram, data_shape(geometry, DetectorWindow.full(geometry)))
@@ -141,29 +156,37 @@ def interleave(sinogram: Tensor, geometry: G) -> tuple[Tensor, G]:
 
 
 def _check_opposites(geometry: Any) -> None:
-    """Whether the opposite rays that :func:`interleave` relies on were measured, and fall between two columns."""
+    """Whether the opposite rays that :func:`interleave` relies on were measured, and fall
+    between two columns."""
     pitch, offset = geometry.pitch, geometry.offset
     if isinstance(geometry, ConeBeam):
         pitch, offset = pitch[1], offset[1]
     quarters = (geometry.column_positions[0] / pitch) % 0.5
     if abs(quarters - 0.25) > 0.1:
         raise ValueError(
-            f"interleave needs columns a quarter pitch beside the axis, offset {offset:g} mm at a pitch of {pitch:g} "
+            f"interleave needs columns a quarter pitch beside the axis, offset {offset:g} mm at a "
+            f"pitch of {pitch:g} "
             "mm leaves opposite rays on one another: filter the sinogram as it is"
         )
     _, _, span = view_steps(geometry.angles)
     if span < 2.0 * math.pi:
         raise ValueError(
-            f"interleave needs the opposite of every ray, the views cover {math.degrees(span):.1f}° of 360°"
+            "interleave needs the opposite of every ray, the views cover "
+            f"{math.degrees(span):.1f}° of 360°"
         )
     parallel = isinstance(geometry, ParallelBeam)
-    radius = pitch / (1.0 if parallel else geometry.magnification) / (2.0 * view_step(geometry.angles))
+    radius = (
+        pitch / (1.0 if parallel else geometry.magnification) / (2.0 * view_step(geometry.angles))
+    )
     field = float(np.abs(geometry.column_positions).max()) if parallel else geometry.fov_radius
     if radius < field / 4.0:
         _LOG.warning(
-            "interleave: with %d views aliasing cancels only within %.1f mm of the axis: use more views, or filter the "
-            "sinogram as it is", geometry.views, radius,
-        )  # fmt: skip
+            "interleave: with %d views aliasing cancels only within %.1f mm of the axis: use more "
+            "views, or filter the "
+            "sinogram as it is",
+            geometry.views,
+            radius,
+        )
 
 
 @checked
@@ -177,57 +200,77 @@ def fbp(
     motion: Any = None,
     outside: float | None = None,
 ) -> Tensor:
-    """Filtered backprojection (Feldkamp, Davis and Kress, J. Opt. Soc. Am. A 1, 612, 1984, for a cone beam).
+    """Filtered backprojection (Feldkamp, Davis and Kress, J. Opt. Soc. Am. A 1, 612, 1984, for a
+    cone beam).
 
-    With ``motion`` each view's filtered data are backprojected along the rays that met the displaced object (Schäfer,
-    Borgert, Rasche and Grass, IEEE Trans. Med. Imaging 25, 895, 2006). That neglects how the motion changes the
-    density of the rays through the object, by (mm per rad of rotation) / sod: 0.1 % for a coronary artery.
+    With ``motion`` each view's filtered data are backprojected along the rays that met the
+    displaced object (Schäfer, Borgert, Rasche and Grass, IEEE Trans. Med. Imaging 25, 895, 2006).
+    That neglects how the motion changes the density of the rays through the object, by (mm per rad
+    of rotation) / sod: 0.1 % for a coronary artery.
 
-    A full turn of an offset detector (half fan) is weighted after Wang (Med. Phys. 29, 1634, 2002), and the grid may
-    reach as far as the long side. Where the rows end inside the object, they are continued by cylinders of ``outside``.
+    A full turn of an offset detector (half fan) is weighted after Wang (Med. Phys. 29, 1634, 2002),
+    and the grid may reach as far as the long side. Where the rows end inside the object, they are
+    continued by cylinders of ``outside``.
 
     Args:
-        sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64. NaN and Inf are dead readings:
-            they are bridged by their neighbours (:func:`torchpcct.readings.bridge`) with a warning.
-        geometry: parallel, fan or cone beam; a closed circle, a short scan (at least π plus the fan angle), views in
-            any order, irregularly spaced or repeated; or a :class:`~torchpcct.vector_geometry.VectorGeometry` that is
-            nearly so (:mod:`recon.analytic.any_orbit`).
+        sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64. NaN and Inf
+            are dead readings: they are bridged by their neighbours
+            (:func:`torchpcct.readings.bridge`) with a warning.
+        geometry: parallel, fan or cone beam; a closed circle, a short scan (at least π plus the fan
+            angle), views in any order, irregularly spaced or repeated; or a
+            :class:`~torchpcct.vector_geometry.VectorGeometry` that is nearly so
+            (:mod:`recon.analytic.any_orbit`).
         grid: voxels to reconstruct, 2-D for parallel and fan beams, 3-D for cone beams.
-        kernel: reconstruction kernel ``"soft"``, ``"standard"``, ``"detail"``, ``"bone"``, ``"ram-lak"``, or several.
+        kernel: reconstruction kernel ``"soft"``, ``"standard"``, ``"detail"``, ``"bone"``,
+            ``"ram-lak"``, or several.
         weights: angular weights that replace the automatic ones, see :func:`filter_sinogram`.
         motion: displacement of everything in the scan in every view, see :func:`backproject`.
-        outside: attenuation in mm⁻¹ (unit of ``sinogram`` per mm) of the object beyond the detector's edges, e.g. that
-            of water; 0: there is none, rows that do not end in air are inconsistent. None: 0, with a warning if the
-            rows look cut off.
+        outside: attenuation in mm⁻¹ (unit of ``sinogram`` per mm) of the object beyond the
+            detector's edges, e.g. that of water; 0: there is none, rows that do not end in air are
+            inconsistent. None: 0, with a warning if the rows look cut off.
 
     Returns:
-        ``(..., *grid.shape)`` mm⁻¹; with a sequence of kernels a leading axis of kernels. Differentiable to any order
-        (columns that were added beyond the edges count as constant).
+        ``(..., *grid.shape)`` mm⁻¹; with a sequence of kernels a leading axis of kernels.
+        Differentiable to any order (columns that were added beyond the edges count as constant).
 
     Raises:
-        ValueError, TypeError: as :func:`filter_sinogram` and :func:`backproject`; views of which more than a quarter is
-            dead; a negative ``outside``.
+        ValueError, TypeError: as :func:`filter_sinogram` and :func:`backproject`; views of which
+            more than a quarter is dead; a negative ``outside``.
 
     Example:
         >>> import numpy as np, torch
         >>> from torchpcct import ParallelBeam, VolumeGrid
         >>> geometry = ParallelBeam(np.arange(90) * np.pi / 90, 64, 1.0)
-        >>> chords = 0.04 * np.sqrt(np.clip(20.0**2 - geometry.column_positions**2, 0.0, None))  # of a disc of water
-        >>> image = fbp(torch.from_numpy(np.tile(chords, (90, 1))), geometry, VolumeGrid((33, 33), 1.0), "soft")
+        >>> # Line integrals of a disc of water.
+        >>> chords = 0.04 * np.sqrt(np.clip(20.0**2 - geometry.column_positions**2, 0.0, None))
+        >>> sinogram = torch.from_numpy(np.tile(chords, (90, 1)))
+        >>> image = fbp(sinogram, geometry, VolumeGrid((33, 33), 1.0), "soft")
         >>> round(float(image[12:21, 12:21].mean()), 3)
         0.02
     """
     if isinstance(geometry, VectorGeometry):
-        lines, circle = rebin_to_circle(sinogram, geometry if motion is None else geometry.moved(motion))
+        lines, circle = rebin_to_circle(
+            sinogram, geometry if motion is None else geometry.moved(motion)
+        )
         if circle.slices is not None:
             lines, grid = at_slices(lines, circle.slices, grid), grid.slice
-        return fbp(lines, circle.geometry, grid, kernel, weights=weights, motion=circle.motion, outside=outside)
+        return fbp(
+            lines,
+            circle.geometry,
+            grid,
+            kernel,
+            weights=weights,
+            motion=circle.motion,
+            outside=outside,
+        )
     check_data("sinogram", sinogram, data_shape(geometry, DetectorWindow.full(geometry)))
     refuse_helix(geometry, motion)
     for text in check_rows(geometry, grid, motion):
         _LOG.warning("%s", text)
     repaired = _without_dead(sinogram, geometry)
-    rows = _completed(Rows(repaired, geometry, _check_weights(weights, geometry, grid)), grid, motion, outside)
+    rows = _completed(
+        Rows(repaired, geometry, _check_weights(weights, geometry, grid)), grid, motion, outside
+    )
     window = read_window(rows.geometry, grid, motion)
     filtered = filter_sinogram(rows.lines, rows.geometry, kernel, window, weights=rows.weights)
     return backproject(filtered, rows.geometry, grid, window, motion=motion)
@@ -236,9 +279,9 @@ def fbp(
 class Fbp(nn.Module):
     """:func:`fbp` of one geometry on one grid as a layer of a network, without parameters.
 
-    Shape:
-        ``(..., views, [rows,] columns)`` → ``(..., *grid.shape)``: axes of batch and channel go through. float32 or
-        float64; float16 and bfloat16, as autocast leaves them, are computed and returned in float32.
+    Shape: ``(..., views, [rows,] columns)`` → ``(..., *grid.shape)``: axes of batch and channel go
+        through. float32 or float64; float16 and bfloat16, as autocast leaves them, are computed and
+        returned in float32.
 
     Args:
         geometry: parallel, fan or cone beam.
@@ -270,16 +313,21 @@ class Fbp(nn.Module):
         return fbp(sinogram.float() if narrow else sinogram, self.geometry, self.grid, self.kernel)
 
     def extra_repr(self) -> str:
-        return f"{type(self.geometry).__name__}, {self.geometry.shape} -> {self.grid.shape}, {self.kernel}"
+        return (
+            f"{type(self.geometry).__name__}, {self.geometry.shape} -> {self.grid.shape}, "
+            f"{self.kernel}"
+        )
 
 
-# To torch.compile and torch.export a layer is one operation, as a pass of the projector is: they cannot look into
-# numba kernels. A traced graph holds the handle of its layer.
+# To torch.compile and torch.export a layer is one operation, as a pass of the projector is: they
+# cannot look into numba kernels. A traced graph holds the handle of its layer.
 _LAYERS: weakref.WeakValueDictionary[int, Fbp] = weakref.WeakValueDictionary()
 _HANDLES = itertools.count()
 
 
-@torch.library.custom_op("torchpcct::fbp", mutates_args=(), schema="(Tensor sinogram, int layer) -> Tensor")
+@torch.library.custom_op(
+    "torchpcct::fbp", mutates_args=(), schema="(Tensor sinogram, int layer) -> Tensor"
+)
 def _traced(sinogram: Tensor, layer: int) -> Tensor:
     return _LAYERS[layer]._computed(sinogram)
 
@@ -289,11 +337,15 @@ def _shape(sinogram: Tensor, layer: int) -> Tensor:
     of = _LAYERS[layer]
     narrow = sinogram.dtype in (torch.float16, torch.bfloat16)
     lead = sinogram.shape[: sinogram.dim() - len(of.geometry.shape)]
-    return sinogram.new_empty((*lead, *of.grid.shape), dtype=torch.float32 if narrow else sinogram.dtype)
+    return sinogram.new_empty(
+        (*lead, *of.grid.shape), dtype=torch.float32 if narrow else sinogram.dtype
+    )
 
 
 @torch.library.custom_op(
-    "torchpcct::fbp_gradient", mutates_args=(), schema="(Tensor sinogram, Tensor gradient, int layer) -> Tensor"
+    "torchpcct::fbp_gradient",
+    mutates_args=(),
+    schema="(Tensor sinogram, Tensor gradient, int layer) -> Tensor",
 )
 def _traced_gradient(sinogram: Tensor, gradient: Tensor, layer: int) -> Tensor:
     def found() -> Tensor:
@@ -326,16 +378,22 @@ _SIDES = ("first", "last")
 
 
 def _transformed() -> bool:
-    """Whether values cannot be looked at: inside ``torch.func`` transforms the data may stand for a whole batch."""
+    """Whether values cannot be looked at: inside ``torch.func`` transforms the data may stand
+    for a whole batch."""
     return torch._C._functorch.maybe_current_level() is not None
 
 
 def _without_dead(sinogram: Tensor, geometry: Geometry) -> Tensor:
-    if _transformed() or not sinogram.numel() or all(map(math.isfinite, torch.aminmax(sinogram.detach()))):
+    if (
+        _transformed()
+        or not sinogram.numel()
+        or all(map(math.isfinite, torch.aminmax(sinogram.detach())))
+    ):
         return sinogram
     dead = ~torch.isfinite(sinogram.detach())
     warnings.warn(
-        f"{int(dead.sum())} of {dead.numel()} readings are NaN or Inf: they are taken for dead and bridged by their "
+        f"{int(dead.sum())} of {dead.numel()} readings are NaN or Inf: they are taken for dead "
+        "and bridged by their "
         "neighbours",
         UserWarning,
         stacklevel=4,
@@ -350,14 +408,20 @@ def _completed(rows: Rows, grid: VolumeGrid, motion: Any, outside: float | None)
         sides = cut_off(rows.lines, rows.geometry, rows.weights)
         if any(sides) and outside is None:
             warnings.warn(
-                f"the rows end inside the object at the {' and the '.join(_SIDES[i] for i in (0, 1) if sides[i])} "
-                "column: CT numbers will be wrong, most near the edge of the field of view; pass outside= the "
+                "the rows end inside the object at the "
+                f"{' and the '.join(_SIDES[i] for i in (0, 1) if sides[i])} "
+                "column: CT numbers will be wrong, most near the edge of the field of view; pass "
+                "outside= the "
                 "attenuation in mm⁻¹ of what lies beyond (0 to do without)",
                 UserWarning,
                 stacklevel=4,
             )
         rows = continued(rows, sides, outside or 0.0)
-    shift = 0.0 if motion is None else float(np.hypot(*np.asarray(motion, dtype=np.float64)[:, -2:].T).max())
+    shift = (
+        0.0
+        if motion is None
+        else float(np.hypot(*np.asarray(motion, dtype=np.float64)[:, -2:].T).max())
+    )
     return mirrored(rows, grid, shift)
 
 
@@ -366,4 +430,5 @@ def read_window(geometry: Geometry, grid: VolumeGrid, motion: Any = None) -> Det
     try:
         return footprint(geometry, grid, margin=1, motion=motion)
     except ValueError:
-        return DetectorWindow.full(geometry)  # a grid larger than the field of view: the backprojection decides
+        # a grid larger than the field of view: the backprojection decides
+        return DetectorWindow.full(geometry)

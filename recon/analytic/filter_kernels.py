@@ -1,4 +1,5 @@
-"""Numba kernels that weight detector rows and move them into a frame that is common to all views."""
+"""Numba kernels that weight detector rows and move them into a frame that is common to all
+views."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ _OPTIONS: Any = {"nogil": True, "cache": True, "error_model": "numpy"}
 def align(begin, end, data, angular, cosine, first, offset, out):
     """``out[v, r, offset[v] + i] = angular · cosine · data[v, r, i]``, zero elsewhere.
 
-    ``angular (V, 1 or columns)`` and ``cosine (R, columns)`` refer to detector columns, ``first[v] + i``.
+    ``angular (V, 1 or columns)`` and ``cosine (R, columns)`` refer to detector columns, ``first[v]
+    + i``.
     """
     _, rows, width = data.shape
     length = out.shape[2]

@@ -1,7 +1,8 @@
 """Ramp filtering of detector rows, from one window of columns to another, and its exact transpose.
 
-Filtering is a linear convolution along the columns with the closed-form apodised kernel, so that the result does not
-depend on how it is computed: as a matrix product where few columns go in or out, by FFT otherwise.
+Filtering is a linear convolution along the columns with the closed-form apodised kernel, so that
+the result does not depend on how it is computed: as a matrix product where few columns go in or
+out, by FFT otherwise.
 """
 
 from __future__ import annotations
@@ -24,21 +25,26 @@ from torchpcct.validate import shaped
 
 __all__ = ["CHUNK_BYTES", "FilterPlan"]
 
-#: Intermediate results of filtering are kept near this size; larger scans are processed in chunks of views.
+# : Intermediate results of filtering are kept near this size; larger scans are processed in chunks
+# of views.
 CHUNK_BYTES = 48 * 2**20
-#: Matrix products and FFTs per nanosecond on a common core, only used to choose the faster of the two.
-_GEMM_FLOPS, _FFT_FLOPS = 40.0, 4.0
+# : Matrix products and FFTs per nanosecond on a common core, only used to choose the faster of the
+# two.
+_GEMM_FLOPS = 40.0
+_FFT_FLOPS = 4.0
 
 
 def _lookup(kernels: NDArray[np.float64], lag: NDArray[np.int64]) -> NDArray[np.float64]:
-    """``kernels[:, lag]``, zero where the lag lies beyond the samples (no data at that distance)."""
+    """``kernels[:, lag]``, zero where the lag lies beyond the samples (no data at that
+    distance)."""
     inside = lag < kernels.shape[1]
     return np.where(inside, kernels[:, np.where(inside, lag, 0)], 0.0)
 
 
 @dataclass(frozen=True)
 class FilterPlan:
-    """Weights and kernels of one filtering task: ``(..., V, rows_in, width_in) → (..., K, V, rows_out, width_out)``.
+    """Weights and kernels of one filtering task: ``(..., V, rows_in, width_in) → (..., K, V,
+    rows_out, width_out)``.
 
     Data of 2-D geometries have one row here.
     """
@@ -55,11 +61,17 @@ class FilterPlan:
         g, a, b = self.geometry, self.window_in, self.window_out
         for name, w in (("window_in", a), ("window_out", b)):
             w.check(g, name)
-        shaped("angular", self.angular, (g.views, 1 if np.shape(self.angular)[-1:] == (1,) else g.columns))
+        shaped(
+            "angular",
+            self.angular,
+            (g.views, 1 if np.shape(self.angular)[-1:] == (1,) else g.columns),
+        )
         if b.first_row < a.first_row or b.first_row + b.rows > a.first_row + a.rows:
             raise ValueError(
-                f"the window to fill has rows {b.first_row}…{b.first_row + b.rows - 1}, but the data only rows "
-                f"{a.first_row}…{a.first_row + a.rows - 1}: filtering needs every row that it returns"
+                f"the window to fill has rows {b.first_row}…{b.first_row + b.rows - 1}, but the "
+                "data only rows "
+                f"{a.first_row}…{a.first_row + a.rows - 1}: filtering needs every row that it "
+                "returns"
             )
         if isinstance(g, ParallelBeam):
             pitch, curved = g.pitch, False
@@ -71,19 +83,25 @@ class FilterPlan:
             u, v = g.column_positions, np.zeros(1)
             if isinstance(g, ConeBeam):
                 v = g.row_positions[b.first_row : b.first_row + b.rows]
-            if curved:  # Kak & Slaney eq. 3.97: R′ = R · D · cos γ; one D goes into the distance weight D²/L²
+            # Kak & Slaney eq. 3.97: R′ = R · D · cos γ; one D goes into the distance weight D²/L²
+            if curved:
                 cosine = np.cos(u / g.sdd) * (g.sdd / np.hypot(g.sdd, v))[:, None] / g.sod
             else:
                 cosine = g.sdd / np.sqrt(g.sdd**2 + u**2 + v[:, None] ** 2)
         else:
-            raise TypeError(f"geometry must be a ParallelBeam, FanBeam or ConeBeam, got {type(g).__name__}")
-        samples = np.stack([ramp_kernel(g.columns, pitch, k, equiangular=curved) * pitch for k in self.kernels])
+            raise TypeError(
+                f"geometry must be a ParallelBeam, FanBeam or ConeBeam, got {type(g).__name__}"
+            )
+        samples = np.stack(
+            [ramp_kernel(g.columns, pitch, k, equiangular=curved) * pitch for k in self.kernels]
+        )
         object.__setattr__(self, "samples", samples)
         object.__setattr__(self, "cosine", cosine)
 
     @property
     def _offset(self) -> NDArray[np.int64]:
-        """Position of the data of every view in a frame in which the results start at the same place."""
+        """Position of the data of every view in a frame in which the results start at the same
+        place."""
         shift = self.window_in.first_column - self.window_out.first_column
         return shift - shift.min()
 
@@ -120,7 +138,9 @@ class FilterPlan:
         lag = np.arange(size)
         lag = np.where(lag < size - (self._length - 1), lag, lag - size) - low
         response = torch.from_numpy(np.fft.rfft(_lookup(self.samples, np.abs(lag))))
-        return response.to(dtype=torch.promote_types(like.dtype, torch.complex32), device=like.device)
+        return response.to(
+            dtype=torch.promote_types(like.dtype, torch.complex32), device=like.device
+        )
 
     def _weights(self, like: Tensor) -> list[Any]:
         number = np.float64 if like.dtype == torch.float64 else np.float32
@@ -128,14 +148,19 @@ class FilterPlan:
         return [self.angular.astype(number), np.ascontiguousarray(rows, dtype=number)]
 
     def forward(self, data: Tensor) -> Tensor:
-        """Weight and filter: ``(..., V, rows_in, width_in)`` to ``(..., K, V, rows_out, width_out)``."""
+        """Weight and filter: ``(..., V, rows_in, width_in)`` to ``(..., K, V, rows_out,
+        width_out)``."""
         from recon.analytic.filter_kernels import align  # numba loads with its first use
 
         a, b = self.window_in, self.window_out
         lead = data.shape[:-3]
         data = data.reshape(math.prod(lead), *data.shape[-3:])
         out = data.new_empty((data.shape[0], len(self.kernels), a.views, b.rows, b.columns))
-        responses, (angular, cosine), offset = self._responses(data), self._weights(data), self._offset
+        responses, (angular, cosine), offset = (
+            self._responses(data),
+            self._weights(data),
+            self._offset,
+        )
         r0, first, chunk = b.first_row - a.first_row, a.first_column, self.chunk
         buffer = data.new_empty((chunk, b.rows, self._length))
         for v0 in range(0, a.views, chunk):
@@ -144,7 +169,9 @@ class FilterPlan:
             for source, target in zip(data, out, strict=True):
                 rows = source[v0:v1, r0 : r0 + b.rows]
                 views = angular[v0:v1], cosine, first[v0:v1], offset[v0:v1]
-                run(align, v1 - v0, rows.numpy(), *views, frame.numpy(), operations=frame[0].numel())
+                run(
+                    align, v1 - v0, rows.numpy(), *views, frame.numpy(), operations=frame[0].numel()
+                )
                 self._convolve(frame, responses, target[:, v0:v1])
         return out.view(*lead, *out.shape[1:])
 
@@ -160,14 +187,19 @@ class FilterPlan:
             target.copy_(torch.fft.irfft(spectrum * response, n=self._fft_size)[..., :width])
 
     def transpose(self, gradient: Tensor) -> Tensor:
-        """Transpose of :meth:`forward`: ``(..., K, V, rows_out, width_out)`` to ``(..., V, rows_in, width_in)``."""
+        """Transpose of :meth:`forward`: ``(..., K, V, rows_out, width_out)`` to ``(..., V,
+        rows_in, width_in)``."""
         from recon.analytic.filter_kernels import unalign  # numba loads with its first use
 
         a, b = self.window_in, self.window_out
         lead = gradient.shape[:-4]
         gradient = gradient.reshape(math.prod(lead), *gradient.shape[-4:])
         out = gradient.new_zeros((gradient.shape[0], a.views, a.rows, a.columns))
-        responses, (angular, cosine), offset = self._responses(gradient), self._weights(gradient), self._offset
+        responses, (angular, cosine), offset = (
+            self._responses(gradient),
+            self._weights(gradient),
+            self._offset,
+        )
         r0, first, chunk = b.first_row - a.first_row, a.first_column, self.chunk
         for v0 in range(0, a.views, chunk):
             v1 = min(v0 + chunk, a.views)
@@ -175,7 +207,14 @@ class FilterPlan:
                 frame = self._correlate(source[:, v0:v1], responses)
                 rows = target[v0:v1, r0 : r0 + b.rows]
                 views = angular[v0:v1], cosine, first[v0:v1], offset[v0:v1]
-                run(unalign, v1 - v0, frame.numpy(), *views, rows.numpy(), operations=frame[0].numel())
+                run(
+                    unalign,
+                    v1 - v0,
+                    frame.numpy(),
+                    *views,
+                    rows.numpy(),
+                    operations=frame[0].numel(),
+                )
         return out.view(*lead, *out.shape[1:])
 
     def _correlate(self, gradient: Tensor, responses: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
 """FBP of a small inset from a scan: filter once, backproject onto any number of grids.
 
-A windowed scan is split by linearity: its surround, the same in every view and noise free, is filtered once; the
-difference of each realisation to the surround is zero outside the window and is filtered from the window alone. The sum
-equals the FBP of the whole rows.
+A windowed scan is split by linearity: its surround, the same in every view and noise free, is
+filtered once; the difference of each realisation to the surround is zero outside the window and is
+filtered from the window alone. The sum equals the FBP of the whole rows.
 """
 
 from __future__ import annotations
@@ -34,12 +34,14 @@ __all__ = ["InsetFbp", "require_inside", "static_fbp", "view_motion"]
 
 
 SAME_SURROUND = 1e-4
-"""Difference of line integrals up to which two surrounds are one: rounding of float32 stays below 1e-5, and
-behind 24 cm of fat it is worth 0.02 HU."""
+"""Difference of line integrals up to which two surrounds are one: rounding of float32 stays below
+1e-5, and behind 24 cm of fat it is worth 0.02 HU."""
 
 
 @checked
-def view_motion(motion: SinusoidalMotion, geometry: Geometry, rotation_s: float) -> NDArray[np.float64]:
+def view_motion(
+    motion: SinusoidalMotion, geometry: Geometry, rotation_s: float
+) -> NDArray[np.float64]:
     """Displacement of a moving body in every view, as projectors and backprojectors take it.
 
     Args:
@@ -60,7 +62,8 @@ def view_motion(motion: SinusoidalMotion, geometry: Geometry, rotation_s: float)
 
 @checked
 def static_fbp(lines: Tensor, geometry: ConeBeam, grid: VolumeGrid) -> Tensor:
-    """FBP (standard kernel) of readings that are the same in every view (rotationally symmetric objects).
+    """FBP (standard kernel) of readings that are the same in every view (rotationally symmetric
+    objects).
 
     Args:
         lines: ``(..., rows, columns)`` line integrals of one view.
@@ -77,14 +80,19 @@ def static_fbp(lines: Tensor, geometry: ConeBeam, grid: VolumeGrid) -> Tensor:
     return backproject(_static(lines, geometry, "standard", part), geometry, grid, part)
 
 
-def _static(lines: Tensor, geometry: ConeBeam, kernel: str | Sequence[str], part: DetectorWindow) -> Tensor:
-    """Filtered readings ``([kernels,] ..., views, rows, columns)`` on ``part`` of lines that all views share."""
+def _static(
+    lines: Tensor, geometry: ConeBeam, kernel: str | Sequence[str], part: DetectorWindow
+) -> Tensor:
+    """Filtered readings ``([kernels,] ..., views, rows, columns)`` on ``part`` of lines that all
+    views share."""
     weights = angular_weights(geometry)
     if not np.allclose(weights, weights[0, 0], rtol=1e-6, atol=0):
         whole = lines.unsqueeze(-3).expand(*lines.shape[:-2], *geometry.shape)
         return filter_sinogram(whole, geometry, kernel, part)
     one = geometry.select([0])
-    return part.take(filter_sinogram(lines.unsqueeze(-3), one, kernel, weights=weights[:1, :1]).squeeze(-3))
+    return part.take(
+        filter_sinogram(lines.unsqueeze(-3), one, kernel, weights=weights[:1, :1]).squeeze(-3)
+    )
 
 
 @checked
@@ -92,16 +100,19 @@ def require_inside(inner: DetectorWindow, window: DetectorWindow) -> None:
     """Refuse a grid whose footprint ``inner`` the scan's window does not hold (ValueError)."""
     if not window.holds(inner):
         raise ValueError(
-            "the grid reaches beyond the region that this scan was acquired for: acquire it with a larger region"
+            "the grid reaches beyond the region that this scan was acquired for: acquire it with "
+            "a larger region"
         )
 
 
 def require_same_surround(scan: Scan, lines: Tensor) -> None:
-    """Refuse a scan whose surround is not that of ``lines``, its line integrals ``(rows, columns)`` (ValueError)."""
+    """Refuse a scan whose surround is not that of ``lines``, its line integrals ``(rows,
+    columns)`` (ValueError)."""
     own = scan.surround_line_integrals()
     if own.shape != lines.shape or not float((own - lines.to(own)).abs().max()) <= SAME_SURROUND:
         raise ValueError(
-            "this scan has another surround (or water correction) than the scan that this was made for: reconstruct "
+            "this scan has another surround (or water correction) than the scan that this was "
+            "made for: reconstruct "
             "scans of different objects or scanners one by one"
         )
 
@@ -109,34 +120,36 @@ def require_same_surround(scan: Scan, lines: Tensor) -> None:
 class InsetFbp:
     """FBP of one or several grids from scans that share geometry, window and surround.
 
-    A counting-mode scan is reconstructed in HU: call the object with it. A stack of parallel or fan-beam slices needs
-    3-D grids with as many voxels along z. Rows that end inside the object are continued by water
-    (:func:`recon.analytic.coverage.consistency_warnings` says so).
-    Channels of line integrals (energy bins,
-    basis materials) on the scan's window go to :meth:`images`.
+    A counting-mode scan is reconstructed in HU: call the object with it. A stack of parallel or
+    fan-beam slices needs 3-D grids with as many voxels along z. Rows that end inside the object are
+    continued by water (:func:`recon.analytic.coverage.consistency_warnings` says so). Channels of
+    line integrals (energy bins, basis materials) on the scan's window go to :meth:`images`.
 
-    The split of the readings also compensates motion: the surround stands still while the inset moves, so the surround
-    is backprojected at rest, the difference with the grid displaced in every view, and the sum shows the inset at rest.
-    Backprojecting whole readings with the displacement would move the patient's body with the vessel. The difference
-    of the logarithms is linear in the inset up to beam hardening (the inset is seen through the same fat everywhere)
-    and in the surround up to the fat that the inset displaces, which moves with it as part of the difference.
+    The split of the readings also compensates motion: the surround stands still while the inset
+    moves, so the surround is backprojected at rest, the difference with the grid displaced in every
+    view, and the sum shows the inset at rest. Backprojecting whole readings with the displacement
+    would move the patient's body with the vessel. The difference of the logarithms is linear in the
+    inset up to beam hardening (the inset is seen through the same fat everywhere) and in the
+    surround up to the fat that the inset displaces, which moves with it as part of the difference.
 
     Attributes:
-        circle: the geometry that is filtered: that of the scan, or the ideal circle next to one given view by view.
+        circle: the geometry that is filtered: that of the scan, or the ideal circle next to one
+            given view by view.
 
     Args:
         scan: any scan of the family; its noise does not matter.
         grids: ``(z, y, x)`` grids inside the field of view.
         kernels: reconstruction kernels.
-        surround: line integrals of every cell outside the window, the same in all views: ``(channels, rows, columns)``
-            for channels; None: ``(rows, columns)`` of the counting-mode scan.
-        motion: displacement of the inset in every view, ``(views, 3)`` z, y, x mm (:func:`view_motion`); None: at
-            rest.
+        surround: line integrals of every cell outside the window, the same in all views:
+            ``(channels, rows, columns)`` for channels; None: ``(rows, columns)`` of the
+            counting-mode scan.
+        motion: displacement of the inset in every view, ``(views, 3)`` z, y, x mm
+            (:func:`view_motion`); None: at rest.
 
     Raises:
-        ValueError: a spectral scan without ``surround``; a grid outside the field of view or the scan's window; an
-            unknown kernel; a surround of a wrong shape, or motion, in a scan that was acquired without ``region`` (its
-            surround is not known).
+        ValueError: a spectral scan without ``surround``; a grid outside the field of view or the
+            scan's window; an unknown kernel; a surround of a wrong shape, or motion, in a scan that
+            was acquired without ``region`` (its surround is not known).
     """
 
     @checked
@@ -150,25 +163,41 @@ class InsetFbp:
         motion: Any = None,
     ) -> None:
         if surround is None and scan.counts.ndim != 3 and scan.geometry.has_rows:
-            raise ValueError("FBP in HU needs a counting-mode scan; decompose or sum the energy bins before")
-        self.geometry, self.window, self.linearisation = scan.geometry, scan.window, scan.linearisation
+            raise ValueError(
+                "FBP in HU needs a counting-mode scan; decompose or sum the energy bins before"
+            )
+        self.geometry, self.window, self.linearisation = (
+            scan.geometry,
+            scan.window,
+            scan.linearisation,
+        )
         self.grids, self.kernels = tuple(grids), tuple(kernels)
         if scan.window is None and motion is not None:
-            raise ValueError("motion compensation needs the surround at rest: acquire the scan with region=")
+            raise ValueError(
+                "motion compensation needs the surround at rest: acquire the scan with region="
+            )
         if scan.window is None and surround is not None:
-            raise ValueError("a scan of the whole detector has no surround: acquire it with region=")
+            raise ValueError(
+                "a scan of the whole detector has no surround: acquire it with region="
+            )
         self.motion = motion
         self.circle, path = self.geometry, motion
         if isinstance(self.geometry, VectorGeometry):
             self.circle, path = ideal_circle(self.geometry)[:2]
-        self.warnings = [text for grid in self.grids for text in check_rows(self.circle, grid, path)]
+        self.warnings = [
+            text for grid in self.grids for text in check_rows(self.circle, grid, path)
+        ]
         self._lines: Tensor | None = None
         if scan.window is None:
             self._require_slices(scan)
             self.footprint = DetectorWindow.full(self.geometry)
             return
         paths = (None,) if motion is None else (None, motion)
-        windows = [footprint(self.geometry, grid, margin=1, motion=path) for grid in self.grids for path in paths]
+        windows = [
+            footprint(self.geometry, grid, margin=1, motion=path)
+            for grid in self.grids
+            for path in paths
+        ]
         self.footprint = DetectorWindow.union(windows, self.geometry.columns)
         require_inside(self.footprint, scan.window)
         self._lines = scan.surround_line_integrals() if surround is None else surround
@@ -176,7 +205,8 @@ class InsetFbp:
         cells = self.geometry.shape[1:]
         if tuple(self._lines.shape[-2:]) != cells:
             raise ValueError(
-                f"surround must have the shape (channels, {cells[0]}, {cells[1]}), got {tuple(self._lines.shape)}"
+                f"surround must have the shape (channels, {cells[0]}, {cells[1]}), got "
+                f"{tuple(self._lines.shape)}"
             )
         # (kernels, [channels,] views, rows, columns) on the grids' footprint.
         self._surround = _static(self._lines, self.geometry, self.kernels, self.footprint)
@@ -185,30 +215,33 @@ class InsetFbp:
         if self.geometry.has_rows:
             return
         slices = tuple(scan.counts.shape[:-2])
+        held = f"{slices[0]} slices" if slices else "one slice (a 2-D scan)"
         for grid in self.grids:
             if tuple(grid.shape[:-2]) != slices:
                 raise ValueError(
-                    f"this scan of {slices[0] if slices else 'one slice (a 2-D scan)'}{' slices' if slices else ''} "
-                    f"needs a grid of shape {(*slices, 'y', 'x')}, got {grid.shape}"
+                    f"this scan of {held} needs a grid of shape {(*slices, 'y', 'x')}, "
+                    f"got {grid.shape}"
                 )
 
     @cached_property
     def _rest(self) -> list[Tensor]:
         """The surround on every grid, per mm."""
-        return [backproject(self._surround, self.geometry, grid, self.footprint) for grid in self.grids]
+        return [
+            backproject(self._surround, self.geometry, grid, self.footprint) for grid in self.grids
+        ]
 
     @undisturbed
     def images(self, lines: Tensor, outside: float | None = None) -> list[Tensor]:
         """Images of line integrals on the window.
 
         Args:
-            lines: ``(..., [channels,] views, rows, columns)`` on the scan's window (whole detector: without one), e.g.
-                :attr:`torchpcct.spectral.Decomposition.line_integrals` in mm.
+            lines: ``(..., [channels,] views, rows, columns)`` on the scan's window (whole detector:
+                without one), e.g. :attr:`torchpcct.spectral.Decomposition.line_integrals` in mm.
             outside: of :func:`recon.analytic.fbp.fbp`, for scans without a window.
 
         Returns:
-            ``(kernels, ..., [channels,] *grid.shape)`` for every grid: unit of ``lines`` per mm (basis coefficients:
-            dimensionless).
+            ``(kernels, ..., [channels,] *grid.shape)`` for every grid: unit of ``lines`` per mm
+            (basis coefficients: dimensionless).
 
         Raises:
             ValueError, TypeError: a wrong shape or dtype.
@@ -219,7 +252,10 @@ class InsetFbp:
             return [fbp(lines, g, grid, self.kernels, outside=outside) for grid in grids]
         channels = tuple(self._lines.shape[:-2])
         if lines.ndim < 3 or tuple(lines.shape[lines.ndim - 3 - len(channels) : -3]) != channels:
-            raise ValueError(f"lines must have the channels {channels} before the views, got {tuple(lines.shape)}")
+            raise ValueError(
+                f"lines must have the channels {channels} before the views, got "
+                f"{tuple(lines.shape)}"
+            )
         difference = lines - self.window.take(self._lines.to(lines.dtype))
         filtered = filter_sinogram(difference, g, self.kernels, part, held=self.window)
         if self.motion is None:
@@ -230,14 +266,19 @@ class InsetFbp:
 
     @staticmethod
     def _over_batch(surround: Tensor, like: Tensor) -> Tensor:
-        """``(kernels, *rest)`` with axes of length 1 where ``like`` has its batch, after the kernels."""
-        return surround.reshape(len(surround), *[1] * (like.ndim - surround.ndim), *surround.shape[1:])
+        """``(kernels, *rest)`` with axes of length 1 where ``like`` has its batch, after the
+        kernels."""
+        return surround.reshape(
+            len(surround), *[1] * (like.ndim - surround.ndim), *surround.shape[1:]
+        )
 
     @undisturbed
     def __call__(self, scan: Scan) -> list[Tensor]:
         """Volumes in HU, one ``(kernels, *grid.shape)`` float32 tensor per grid."""
         if scan.geometry != self.geometry:
-            raise ValueError("this scan has another geometry than the one that InsetFbp was made for")
+            raise ValueError(
+                "this scan has another geometry than the one that InsetFbp was made for"
+            )
         if scan.window != self.window:
             raise ValueError("this scan has another window than the one that InsetFbp was made for")
         if self._lines is not None and self._of_scan:

@@ -1,7 +1,8 @@
 """Apodisation windows and the ramp filter of filtered backprojection.
 
-The named kernels are the reconstruction kernels published with the CatSim / XCIST simulator, given as five points
-against the fraction of the detector's Nyquist frequency and joined by a quadratic spline, as CatSim joins them.
+The named kernels are the reconstruction kernels published with the CatSim / XCIST simulator, given
+as five points against the fraction of the detector's Nyquist frequency and joined by a quadratic
+spline, as CatSim joins them.
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ _POINTS: dict[str, tuple[float, ...]] = {
 
 def _points(kernel: Any) -> tuple[float, ...]:
     if not isinstance(kernel, str):
-        raise TypeError(f"kernel must be one of {', '.join(map(repr, KERNELS))}, got {type(kernel).__name__}")
+        raise TypeError(
+            f"kernel must be one of {', '.join(map(repr, KERNELS))}, got {type(kernel).__name__}"
+        )
     return _POINTS[choice("kernel", kernel, KERNELS)]
 
 
@@ -55,7 +58,8 @@ def apodization(kernel: str, fraction: ArrayLike) -> Floats:
 
     Args:
         kernel: ``"soft"``, ``"standard"``, ``"detail"``, ``"bone"`` or ``"ram-lak"``.
-        fraction: frequency divided by the Nyquist frequency of the detector columns, any shape; the sign is ignored.
+        fraction: frequency divided by the Nyquist frequency of the detector columns, any shape; the
+            sign is ignored.
 
     Returns:
         float64 of the same shape: 1 at frequency 0, 0 above the Nyquist frequency.
@@ -71,7 +75,8 @@ def apodization(kernel: str, fraction: ArrayLike) -> Floats:
 
 @lru_cache(maxsize=64)
 def _unit_kernel(n: int, kernel: str) -> Floats:
-    """``½ ∫₀¹ x W(x) cos(π m x) dx`` for m = 0 … n−1: the apodised ramp at unit pitch, in closed form."""
+    """``½ ∫₀¹ x W(x) cos(π m x) dx`` for m = 0 … n−1: the apodised ramp at unit pitch, in closed
+    form."""
     window = _window(kernel)
     omega = np.pi * np.arange(1, n, dtype=np.float64)
     out = np.zeros(n)
@@ -80,10 +85,13 @@ def _unit_kernel(n: int, kernel: str) -> Floats:
         out[0] += p.integ()(right - left)
         derivatives = [p, p.deriv(), p.deriv(2), p.deriv(3)]
         for x, sign in ((right, 1.0), (left, -1.0)):
-            # ∫ p cos(ωx) = p sin/ω + p′ cos/ω² − p″ sin/ω³ − p‴ cos/ω⁴ between the ends of the piece
+            # ∫ p cos(ωx) = p sin/ω + p′ cos/ω² − p″ sin/ω³ − p‴ cos/ω⁴ between the ends of the
+            # piece
             d = [float(q(x - left)) for q in derivatives]
             s, co = np.sin(omega * x), np.cos(omega * x)
-            out[1:] += sign * (d[0] * s / omega + d[1] * co / omega**2 - d[2] * s / omega**3 - d[3] * co / omega**4)
+            out[1:] += sign * (
+                d[0] * s / omega + d[1] * co / omega**2 - d[2] * s / omega**3 - d[3] * co / omega**4
+            )
     out *= 0.5
     if kernel == "ram-lak":
         out[2::2] = 0.0  # exact zeros instead of rounding
@@ -92,14 +100,18 @@ def _unit_kernel(n: int, kernel: str) -> Floats:
 
 
 @checked
-def ramp_kernel(n: int, pitch: float, kernel: str = "ram-lak", *, equiangular: bool = False) -> Floats:
-    """Spatial samples of the band-limited, apodised ramp (Kak and Slaney, chapter 3, equations 61 and 103).
+def ramp_kernel(
+    n: int, pitch: float, kernel: str = "ram-lak", *, equiangular: bool = False
+) -> Floats:
+    """Spatial samples of the band-limited, apodised ramp (Kak and Slaney, chapter 3, equations 61
+    and 103).
 
     Args:
         n: number of samples; sample m belongs to the lags ±m columns.
         pitch: column pitch, mm at the isocentre, or rad when ``equiangular``.
         kernel: name of the apodisation window, see :func:`apodization`.
-        equiangular: multiply by ``(γ / sin γ)²`` with γ = m · pitch: columns at equal fan angles (curved detector).
+        equiangular: multiply by ``(γ / sin γ)²`` with γ = m · pitch: columns at equal fan angles
+            (curved detector).
 
     Returns:
         ``(n,)`` float64, in pitch⁻². Convolution sums still need a factor ``pitch``.
@@ -116,12 +128,16 @@ def ramp_kernel(n: int, pitch: float, kernel: str = "ram-lak", *, equiangular: b
     if equiangular:
         gamma = np.arange(n) * pitch
         if gamma[-1] >= np.pi:
-            raise ValueError(f"{n} columns × {pitch} rad reach {np.degrees(gamma[-1]):.0f}°, 180° or more: reduce them")
+            raise ValueError(
+                f"{n} columns × {pitch} rad reach {np.degrees(gamma[-1]):.0f}°, 180° or more: "
+                "reduce them"
+            )
         h[1:] *= (gamma[1:] / np.sin(gamma[1:])) ** 2
     return h
 
 
 @checked
 def fast_length(n: int) -> int:
-    """The smallest length ≥ ``n`` whose only prime factors are 2, 3 and 5 and that is even (fast real FFTs)."""
+    """The smallest length ≥ ``n`` whose only prime factors are 2, 3 and 5 and that is even (fast
+    real FFTs)."""
     return 2 * int(next_fast_len((n + 1) // 2, real=True))

@@ -1,9 +1,11 @@
-"""Volumes larger than memory: a scan is read, filtered and backprojected slab by slab along z, each written at once.
+"""Volumes larger than memory: a scan is read, filtered and backprojected slab by slab along z, each
+written at once.
 
-Of a cone beam a slab needs the detector rows of its footprint, of a stack of parallel or fan-beam slices those slices.
-What decides about the whole (whether the rows end inside the object, how many readings are dead) is found in a first
-pass over the scan; every slab then gets the same bits as in one piece. Slabs do not need each other, so that the
-workers of :mod:`recon.evaluate.execute` may make them, each within the limit.
+Of a cone beam a slab needs the detector rows of its footprint, of a stack of parallel or fan-beam
+slices those slices. What decides about the whole (whether the rows end inside the object, how many
+readings are dead) is found in a first pass over the scan; every slab then gets the same bits as in
+one piece. Slabs do not need each other, so that the workers of :mod:`recon.evaluate.execute` may
+make them, each within the limit.
 """
 
 from __future__ import annotations
@@ -67,19 +69,24 @@ __all__ = ["ScanSlices", "SlabPlan", "StackOptions", "plan_slabs", "reconstruct_
 _LOG = logging.getLogger(__name__)
 
 HALO = 8
-"""Rows read beside those that a slab needs: dead cells are found and bridged with their neighbours' help."""
+"""Rows read beside those that a slab needs: dead cells are found and bridged with their
+neighbours' help."""
 _RESERVE = 150 * 10**6
 """Compiled kernels, and what filters work on (:data:`recon.analytic.filter_plan.CHUNK_BYTES`)."""
-_READINGS, _VOLUMES = 7, 4
+_READINGS = 7
+_VOLUMES = 4
 """Arrays of the size of the readings and of a slab that live at once while either is prepared."""
 _LOOKED_AT = 32
 """Rows in the middle whose readings are tested against their description, at most."""
-_RATE, _READ_RATE = 4e8, 1e8
-"""Voxel updates of the backprojection, and readings that are read and prepared, a second on one core."""
+_RATE = 4e8
+_READ_RATE = 1e8
+"""Voxel updates of the backprojection, and readings that are read and prepared, a second on one
+core."""
 
 
 class StackOptions(TypedDict, total=False):
-    """Options of PWLS in slabs, as :func:`recon.least_squares.reconstruct.reconstruct_pwls` takes them."""
+    """Options of PWLS in slabs, as :func:`recon.least_squares.reconstruct.reconstruct_pwls`
+    takes them."""
 
     prior: QGGMRF | None
     tolerance: float
@@ -92,8 +99,8 @@ class Part(NamedTuple):
     Attributes:
         scan: of a cone beam with ``HALO`` rows more on either side.
         own: where they stand in it.
-        zeros, replaced, dead: how many of their readings registered nothing, are such as no object can cause, and are
-            bridged by their neighbours.
+        zeros, replaced, dead: how many of their readings registered nothing, are such as no object
+            can cause, and are bridged by their neighbours.
     """
 
     scan: Scan
@@ -104,10 +111,12 @@ class Part(NamedTuple):
 
 
 class ScanSlices:
-    """A scan of which no more than some slices (of a cone beam: rows of the detector) are in memory at a time.
+    """A scan of which no more than some slices (of a cone beam: rows of the detector) are in memory
+    at a time.
 
     Args:
-        scan: a scan, or a file that is read in parts: ours, Data Exchange, a ``.yaml`` stack of ``.npy``, Zarr or TIFF.
+        scan: a scan, or a file that is read in parts: ours, Data Exchange, a ``.yaml`` stack of
+            ``.npy``, Zarr or TIFF.
         options: of :func:`torchpcct.formats.scans.open_scan`.
 
     Attributes:
@@ -117,8 +126,8 @@ class ScanSlices:
         first: its first slices.
 
     Raises:
-        ValueError: a scan that has to be read as a whole (a part of the detector, energy bins, a geometry view by view;
-            CatSim's and DICOM-CT-PD files).
+        ValueError: a scan that has to be read as a whole (a part of the detector, energy bins, a
+            geometry view by view; CatSim's and DICOM-CT-PD files).
     """
 
     window = None
@@ -126,14 +135,19 @@ class ScanSlices:
     def __init__(self, scan: Scan | str | os.PathLike[str], **options: Any) -> None:
         takes = {"slices"} if isinstance(scan, Scan) else own_options(scan)
         if "slices" not in takes:
-            raise ValueError(f"{scan} is no file that is read slice by slice: open_scan(…).save(…) makes an .h5 of it")
+            raise ValueError(
+                f"{scan} is no file that is read slice by slice: open_scan(…).save(…) makes an "
+                ".h5 of it"
+            )
         self.source, self.options = scan, options
         self.cells: Cells | None = None
         self.photon: float | None = None
         try:
             self.first = self._open(0, 4)
         except NoSlicesError as error:
-            raise ValueError(f"{scan} can only be read as a whole: leave out memory= ({error})") from error
+            raise ValueError(
+                f"{scan} can only be read as a whole: leave out memory= ({error})"
+            ) from error
         # What the readers estimate from the readings must not differ from slab to slab.
         info = self.first.info
         if "gain" in takes and "signal_of_one_photon" in info:
@@ -151,7 +165,12 @@ class ScanSlices:
 
     def __getstate__(self) -> dict[str, Any]:
         """For another process, which reads slabs: the file by its full path, no readings."""
-        return {**self.__dict__, "source": Path(self.source).resolve(), "first": None, "counts": None}  # type: ignore
+        return {
+            **self.__dict__,
+            "source": Path(self.source).resolve(),
+            "first": None,
+            "counts": None,
+        }  # type: ignore
 
     def _open(self, first: int, stop: int) -> Scan:
         part = slice(first, stop)
@@ -159,7 +178,9 @@ class ScanSlices:
             return adapted(self.source, slices=part, **self.options)
         return open_scan(self.source, slices=part, **self.options)
 
-    def seen_grid(self, voxel: float | None = None, extent: Any = None, center: Any = None) -> VolumeGrid:
+    def seen_grid(
+        self, voxel: float | None = None, extent: Any = None, center: Any = None
+    ) -> VolumeGrid:
         """What :meth:`torchpcct.VolumeGrid.of` gives."""
         return grid_of(self, voxel, extent, center)
 
@@ -171,7 +192,9 @@ class ScanSlices:
         cells = (
             None
             if self.cells is None
-            else Cells(self.cells.views, *(c[low : low + raw.geometry.rows] for c in self.cells[1:]))
+            else Cells(
+                self.cells.views, *(c[low : low + raw.geometry.rows] for c in self.cells[1:])
+            )
         )
         scan, own = repair_defects(raw, cells, self.photon)[0], slice(first - low, stop - low)
         _give_back()
@@ -186,7 +209,8 @@ class ScanSlices:
         return Part(scan, own, int((mine(raw.counts) <= 0).sum()), replaced, dead)
 
     def find_cells(self, step: int) -> None:
-        """Find the cells of a cone beam that are dead or of a wrong gain, by all rows, ``step`` rows at a time."""
+        """Find the cells of a cone beam that are dead or of a wrong gain, by all rows, ``step``
+        rows at a time."""
         g = self.geometry
         if not g.has_rows or not is_repaired(self.first):
             return
@@ -215,21 +239,34 @@ class ScanSlices:
             (low > 0, dead[:, : own.start + 1]),
             (low + dead.shape[1] < self.count, dead[:, own.stop - 1 :]),
         ):
-            lost = rows.all(1)  # and no live reading on one side, from which the row itself would be bridged
-            ends = (lost.cummin(-1).values | lost.flip(-1).cummin(-1).values.flip(-1)) if side else lost & False
+            # and no live reading on one side, from which the row itself would be bridged
+            lost = rows.all(1)
+            ends = (
+                (lost.cummin(-1).values | lost.flip(-1).cummin(-1).values.flip(-1))
+                if side
+                else lost & False
+            )
             outer = outer or bool(ends.any())
         if outer:
             raise ValueError(
-                f"too many readings are dead near row {low + own.start}: slabs read {HALO} rows beside their own, "
+                f"too many readings are dead near row {low + own.start}: slabs read {HALO} rows "
+                "beside their own, "
                 "which do not bridge them; reconstruct the whole volume at once"
             )
 
     def identity(self) -> str:
-        """A text that changes with the readings, as far as the file's size and date and the first rows tell."""
+        """A text that changes with the readings, as far as the file's size and date and the
+        first rows tell."""
         text = hashlib.sha256(self.first.counts.numpy().tobytes())
         text.update(
             repr(
-                (self.geometry._key(), self.count, self.unit, self.water, sorted(self.options.items(), key=str))
+                (
+                    self.geometry._key(),
+                    self.count,
+                    self.unit,
+                    self.water,
+                    sorted(self.options.items(), key=str),
+                )
             ).encode()
         )
         if not isinstance(self.source, Scan):
@@ -260,34 +297,53 @@ class SlabPlan:
     def __str__(self) -> str:
         thick = max(stop - first for first, stop in self.slabs)
         return (
-            f"{len(self.slabs)} slabs of up to {thick} slices, {self.memory / 1e9:.2f} GB of memory, reads "
-            f"{self.read / 1e9:.2f} GB, writes {self.written / 1e9:.2f} GB, about {self.seconds:.0f} s on one core"
+            f"{len(self.slabs)} slabs of up to {thick} slices, {self.memory / 1e9:.2f} GB of "
+            "memory, reads "
+            f"{self.read / 1e9:.2f} GB, writes {self.written / 1e9:.2f} GB, about "
+            f"{self.seconds:.0f} s on one core"
         )
 
 
 def _give_back() -> None:
-    """Let the system have the memory that was freed: the C library keeps it, up to several times what is in use."""
+    """Let the system have the memory that was freed: the C library keeps it, up to several times
+    what is in use."""
     with contextlib.suppress(OSError, AttributeError, TypeError):  # another C library than GNU's
         ctypes.CDLL(None).malloc_trim(0)
 
 
 class _Fbp:
-    """The FBP of a volume, of which slabs are made: the steps of :func:`recon.analytic.fbp.fbp`, with its results."""
+    """The FBP of a volume, of which slabs are made: the steps of :func:`recon.analytic.fbp.fbp`,
+    with its results."""
 
     def __init__(
-        self, geometry: Geometry, grid: VolumeGrid, kernel: str, sides: tuple[bool, bool], water: float
+        self,
+        geometry: Geometry,
+        grid: VolumeGrid,
+        kernel: str,
+        sides: tuple[bool, bool],
+        water: float,
     ) -> None:
-        self.geometry, self.grid, self.kernel, self.sides, self.water = geometry, grid, kernel, sides, water
+        self.geometry, self.grid, self.kernel, self.sides, self.water = (
+            geometry,
+            grid,
+            kernel,
+            sides,
+            water,
+        )
         self.cone = isinstance(geometry, ConeBeam)
         self.plane = grid if self.cone else grid.slice
         self.weights = angular_weights(geometry, self.plane)
-        self.wide: Any = self.complete(torch.empty(geometry.shape, device="meta"), geometry).geometry
+        self.wide: Any = self.complete(
+            torch.empty(geometry.shape, device="meta"), geometry
+        ).geometry
         self.window = read_window(self.wide, self.plane)
         self.plan = BackprojectionPlan(self.wide, self.plane, self.window)
 
     def complete(self, lines: Tensor, geometry: Any) -> Rows:
         rows = Rows(lines, geometry, self.weights)
-        return mirrored(continued(rows, self.sides, self.water) if any(self.sides) else rows, self.plane)
+        return mirrored(
+            continued(rows, self.sides, self.water) if any(self.sides) else rows, self.plane
+        )
 
     def band(self, first: int, stop: int) -> tuple[int, int]:
         """Detector rows, or slices, that the slices ``first`` … ``stop - 1`` of the volume need."""
@@ -319,7 +375,9 @@ class _Fbp:
         if self.cone:
             held = held.with_rows(low - own.start, rows.lines.shape[-2])
             wanted = wanted.with_rows(low, high - low)
-        filtered = filter_sinogram(rows.lines, self.wide, self.kernel, wanted, held=held, weights=rows.weights)
+        filtered = filter_sinogram(
+            rows.lines, self.wide, self.kernel, wanted, held=held, weights=rows.weights
+        )
         del rows
         place = ((first, stop), low - self.window.first_row) if self.cone else ()
         mu = self.plan.forward(filtered, *place)
@@ -354,16 +412,16 @@ def plan_slabs(
     Args:
         geometry: of the whole scan: parallel, fan or cone beam.
         grid: ``(z, y, x)``, of a stack ``(slices, y, x)``.
-        memory: bytes that a process may hold, with what it holds already, or a text such as "4GB"; None: what it
-            holds, and its part of what is free.
+        memory: bytes that a process may hold, with what it holds already, or a text such as "4GB";
+            None: what it holds, and its part of what is free.
         method: "fbp"; of stacks also "pwls".
         sides: where the rows end inside the object and are continued (found before the first slab).
         done: slices that are on the disk already.
         parts: slabs at least, if there are slices enough.
 
     Raises:
-        ValueError: a limit that is too small for the thinnest slab, with the smallest that is not; a grid, geometry or
-            method that slabs do not do.
+        ValueError: a limit that is too small for the thinnest slab, with the smallest that is not;
+            a grid, geometry or method that slabs do not do.
     """
     _check(geometry, grid, method)
     base = resident_bytes() + _RESERVE
@@ -386,15 +444,19 @@ def plan_slabs(
         thick = CHUNK * ((thick - 1) // CHUNK) if thick > CHUNK else thick - 1
     if most(thick) > limit:
         raise ValueError(
-            f"memory={memory if memory is not None else limit} is too little: one slice at a time needs "
-            f"{math.ceil(most(1) / 1e6)} MB ({base / 1e6:.0f} MB of them for the program itself): give memory="
+            f"memory={memory if memory is not None else limit} is too little: one slice at a time "
+            "needs "
+            f"{math.ceil(most(1) / 1e6)} MB ({base / 1e6:.0f} MB of them for the program itself): "
+            "give memory="
             f"{math.ceil(most(1) / 1e6)}MB or more, bin the readings, or take larger voxels"
         )
     slabs = tuple(cut(thick))
     bands = tuple(slab if fbp is None else fbp.band(*slab) for slab in slabs)
     row = 4 * geometry.views * geometry.columns
     count = geometry.shape[1] if geometry.has_rows else total
-    read = row * (count + sum(high - low + (2 * HALO if geometry.has_rows else 0) for low, high in bands))
+    read = row * (
+        count + sum(high - low + (2 * HALO if geometry.has_rows else 0) for low, high in bands)
+    )
     voxels = (total - done) * math.prod(grid.shape[1:])
     seconds = voxels * geometry.views / _RATE + read / 4 / _READ_RATE
     return SlabPlan(slabs, bands, most(thick), read, 4 * voxels, seconds)
@@ -404,13 +466,15 @@ def _check(geometry: Geometry, grid: VolumeGrid, method: str) -> None:
     choice("method", method, ("fbp", "pwls"))
     if not isinstance(geometry, ParallelBeam | FanBeam | ConeBeam):
         raise ValueError(
-            "slabs are of parallel, fan or cone beams on a circle: reconstruct a geometry view by view whole"
+            "slabs are of parallel, fan or cone beams on a circle: reconstruct a geometry view by "
+            "view whole"
         )
     if grid.ndim != 3:
         raise ValueError(f"grid must be a (z, y, x) VolumeGrid, got {grid!r}")
     if method == "pwls" and geometry.has_rows:
         raise ValueError(
-            'method "pwls" of a cone beam couples all slices: it needs the whole volume in memory; slabs are for '
+            'method "pwls" of a cone beam couples all slices: it needs the whole volume in '
+            "memory; slabs are for "
             '"fbp", and for stacks of parallel or fan-beam slices'
         )
 
@@ -430,16 +494,18 @@ def reconstruct_to(
 ) -> dict[str, Any]:
     """Reconstruct a volume slab by slab into a file, within a limit of memory.
 
-    The same as :func:`recon.reconstruct` and :meth:`torchpcct.volume.Volume.save`, to the bit on one thread. FBP (FDK)
-    of parallel, fan and cone beams on a circle, PWLS of stacks of slices. If it is interrupted, the finished slabs
-    stay in ``path.unfinished``, and the same call goes on with them. Within :func:`recon.evaluate.execute.using` the
-    slabs of a file are jobs: each worker keeps to ``memory``, reads the file under its full path, and this process puts
-    the slabs into the volume.
+    The same as :func:`recon.reconstruct` and :meth:`torchpcct.volume.Volume.save`, to the bit on
+    one thread. FBP (FDK) of parallel, fan and cone beams on a circle, PWLS of stacks of slices. If
+    it is interrupted, the finished slabs stay in ``path.unfinished``, and the same call goes on
+    with them. Within :func:`recon.evaluate.execute.using` the slabs of a file are jobs: each worker
+    keeps to ``memory``, reads the file under its full path, and this process puts the slabs into
+    the volume.
 
-    What is different: defects are looked for slab by slab, with ``HALO`` rows on either side, so that one at the
-    limits of what is recognised may be judged otherwise; the readings are tested against their description
-    (:mod:`torchpcct.checks.readings`, :func:`recon.analytic.coverage.consistency_warnings`) in the middle rows or
-    slices, which the report's ``notes`` name; and what a file does not tell (its reading of one photon) is estimated
+    What is different: defects are looked for slab by slab, with ``HALO`` rows on either side, so
+    that one at the limits of what is recognised may be judged otherwise; the readings are tested
+    against their description (:mod:`torchpcct.checks.readings`,
+    :func:`recon.analytic.coverage.consistency_warnings`) in the middle rows or slices, which the
+    report's ``notes`` name; and what a file does not tell (its reading of one photon) is estimated
     from its first slices.
 
     Args:
@@ -454,12 +520,13 @@ def reconstruct_to(
         options: of PWLS (:class:`StackOptions`).
 
     Returns:
-        The report: that of a volume, with the plan as ``slabs``, ``memory_bytes``; ``resumed_at``, the first slice of
+        The report: that of a volume, with the plan as ``slabs``, ``memory_bytes``; ``resumed_at``,
+            the first slice of
         this call; ``minimum``, ``maximum`` and ``mean`` of what it wrote.
 
     Raises:
-        ValueError: a limit that is too small, naming the smallest that works; a scan, grid or method that cannot be
-            done in slabs; a starved scan; another ending.
+        ValueError: a limit that is too small, naming the smallest that works; a scan, grid or
+            method that cannot be done in slabs; a starved scan; another ending.
         WriteError: the target cannot be written (a full disk): the finished slabs stay.
         recon.evaluate.execute.LeftOut: slabs whose workers died; the others stay.
     """
@@ -468,12 +535,21 @@ def reconstruct_to(
     g, start = source.geometry, time.perf_counter()
     _check(g, grid, method)
     if not g.has_rows and grid.shape[0] != source.count:
-        raise ValueError(f"this scan of {source.count} slices needs a grid of as many, got {grid.shape}")
+        raise ValueError(
+            f"this scan of {source.count} slices needs a grid of as many, got {grid.shape}"
+        )
     executor = None if isinstance(source.source, Scan) else execute.current()
     parts = 1 if executor is None else 2 * max(1, getattr(executor, "workers", 1))
     plan = plan_slabs(g, grid, memory, method, parts=parts)
     fixed = [*check_rows(g, grid), *sampling_warnings(g)] if method == "fbp" else []
-    all_of_it = source.identity(), grid, method, kernel, sorted(options.items()), source_digest(__name__)
+    all_of_it = (
+        source.identity(),
+        grid,
+        method,
+        kernel,
+        sorted(options.items()),
+        source_digest(__name__),
+    )
     key = hashlib.sha256(repr(all_of_it).encode()).hexdigest()
     thick = plan.slabs[0][1] - plan.slabs[0][0]
     source.find_cells(max(high - low for low, high in plan.bands))
@@ -509,19 +585,26 @@ def reconstruct_to(
     else:
         _as_jobs(executor, maker, plan, key, file.part.with_name(file.part.name + ".slabs"), keep)
     fbp = method == "fbp"
-    metal = sorted((t for t in found if fbp), key=lambda t: -found[t])[:1]  # that of the brightest slab
+    # that of the brightest slab
+    metal = sorted((t for t in found if fbp), key=lambda t: -found[t])[:1]
     warnings = list(dict.fromkeys([*notes["warnings"], *fixed, *(metal if fbp else found)]))
     for text in warnings:
         _LOG.warning("%s", text)
     report = {
-        "method": method, **({"kernel": kernel} if fbp else {}),
-        "seconds": round(time.perf_counter() - start, 3), "warnings": warnings,
+        "method": method,
+        **({"kernel": kernel} if fbp else {}),
+        "seconds": round(time.perf_counter() - start, 3),
+        "warnings": warnings,
         "notes": [*notes["notes"], *(view_notes(g) if fbp else [])],
         "cells_mm": finite_cells(source.geometry),
         "dead_readings": notes["dead_readings"],
-        "slabs": len(plan.slabs), "memory_bytes": plan.memory, "resumed_at": begun,
-        "minimum": low, "maximum": high, "mean": total / max((grid.shape[0] - begun) * math.prod(grid.shape[1:]), 1),
-    }  # fmt: skip
+        "slabs": len(plan.slabs),
+        "memory_bytes": plan.memory,
+        "resumed_at": begun,
+        "minimum": low,
+        "maximum": high,
+        "mean": total / max((grid.shape[0] - begun) * math.prod(grid.shape[1:]), 1),
+    }
     file.finish(report)
     return report
 
@@ -530,40 +613,60 @@ class _Maker:
     """Makes slabs: all that a job is told."""
 
     def __init__(
-        self, source: ScanSlices, grid: VolumeGrid, method: str, kernel: str, sides: tuple[bool, bool],
+        self,
+        source: ScanSlices,
+        grid: VolumeGrid,
+        method: str,
+        kernel: str,
+        sides: tuple[bool, bool],
         options: dict[str, Any],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.source, self.grid, self.method, self.kernel = source, grid, method, kernel
         self.sides, self.options = sides, options
 
     @cached_property
     def fbp(self) -> _Fbp | None:
         source = self.source
-        return _Fbp(source.geometry, self.grid, self.kernel, self.sides, source.water) if self.method == "fbp" else None
+        return (
+            _Fbp(source.geometry, self.grid, self.kernel, self.sides, source.water)
+            if self.method == "fbp"
+            else None
+        )
 
     def __call__(self, first: int, stop: int) -> tuple[NDArray[np.float32], dict[str, float]]:
-        """Values ``(slices, y, x)`` in the scan's unit, and warnings with the brightness that each is for."""
+        """Values ``(slices, y, x)`` in the scan's unit, and warnings with the brightness that
+        each is for."""
         source = self.source
         if self.fbp is None:
             part = _slices_of(self.grid, first, stop)
             volume = reconstruct(source._open(first, stop), part, self.method, **self.options)
             return volume.data.numpy(), dict.fromkeys(volume.report["warnings"], 0.0)
         values = self.fbp(source, first, stop)
-        texts = dict.fromkeys(metal_warnings(values), float(values.max())) if source.unit == "HU" else {}
+        texts = (
+            dict.fromkeys(metal_warnings(values), float(values.max()))
+            if source.unit == "HU"
+            else {}
+        )
         return (values if source.unit == "HU" else from_hu(values, source.water)).numpy(), texts
 
 
-def _as_jobs(executor: Any, maker: _Maker, plan: SlabPlan, key: str, folder: Path, keep: Callable[..., None]) -> None:
+def _as_jobs(
+    executor: Any, maker: _Maker, plan: SlabPlan, key: str, folder: Path, keep: Callable[..., None]
+) -> None:
     """Let workers make the slabs as pieces in ``folder``; each is kept when its turn has come."""
     packed, plane = pickle.dumps(maker), math.prod(maker.grid.shape[1:])
     jobs = [
         execute.Job(
-            f"slices {first} … {stop - 1}", _slab, (packed, key, first, stop), (f"{first}-{stop}.npz",),
-            seconds=plan.seconds * (stop - first) / maker.grid.shape[0], mib=plan.memory / 2**20,
+            f"slices {first} … {stop - 1}",
+            _slab,
+            (packed, key, first, stop),
+            (f"{first}-{stop}.npz",),
+            seconds=plan.seconds * (stop - first) / maker.grid.shape[0],
+            mib=plan.memory / 2**20,
             bytes=4.0 * (stop - first) * plane,
         )
         for first, stop in plan.slabs
-    ]  # fmt: skip
+    ]
     waiting, done = deque(plan.slabs), set[tuple[int, int]]()
 
     def finished(job: execute.Job) -> None:
@@ -571,7 +674,11 @@ def _as_jobs(executor: Any, maker: _Maker, plan: SlabPlan, key: str, folder: Pat
         while waiting and waiting[0] in done:
             first, stop = waiting.popleft()
             piece = _slab_piece(folder, maker, key, first, stop)
-            keep(stop, piece["values"], dict(zip(piece["texts"].tolist(), piece["peaks"].tolist(), strict=True)))
+            keep(
+                stop,
+                piece["values"],
+                dict(zip(piece["texts"].tolist(), piece["peaks"].tolist(), strict=True)),
+            )
             Store(folder).remove(folder / f"{first}-{stop}.npz")
 
     execute.run(jobs, folder, executor, finished=finished)
@@ -591,7 +698,11 @@ def _unpacked(packed: bytes) -> _Maker:
 def _slab_piece(folder: Path, maker: _Maker, key: str, first: int, stop: int) -> dict[str, Any]:
     def compute() -> dict[str, Any]:
         values, texts = maker(first, stop)
-        return {"values": values, "texts": np.array(list(texts), dtype=str), "peaks": np.array(list(texts.values()))}
+        return {
+            "values": values,
+            "texts": np.array(list(texts), dtype=str),
+            "peaks": np.array(list(texts.values())),
+        }
 
     return Store(folder).piece(f"{first}-{stop}", key, compute)
 
@@ -603,7 +714,8 @@ def _slices_of(grid: VolumeGrid, first: int, stop: int) -> VolumeGrid:
 
 
 def _survey(source: ScanSlices, plan: SlabPlan) -> dict[str, Any]:
-    """What has to be known of all readings before the first slab, and what the middle ones say of the scan."""
+    """What has to be known of all readings before the first slab, and what the middle ones say
+    of the scan."""
     g, cone = source.geometry, source.geometry.has_rows
     step = max(high - low for low, high in plan.bands)
     tally, rows = np.zeros(3, np.int64), torch.zeros(g.views, g.columns, dtype=torch.float64)
@@ -622,15 +734,21 @@ def _survey(source: ScanSlices, plan: SlabPlan) -> dict[str, Any]:
     if cone:
         ends = [row_ends((rows / source.count).float()[None])]
     highest, first_column, last_column = zip(*ends, strict=True)
-    sides = ends_cut_off(max(highest), torch.cat(first_column), torch.cat(last_column), g, angular_weights(g))
+    sides = ends_cut_off(
+        max(highest), torch.cat(first_column), torch.cat(last_column), g, angular_weights(g)
+    )
     return {"sides": sides, "dead_readings": dead, **_looked_at(source, plan, replaced, sides)}
 
 
-def _looked_at(source: ScanSlices, plan: SlabPlan, replaced: int, sides: tuple[bool, bool]) -> dict[str, Any]:
+def _looked_at(
+    source: ScanSlices, plan: SlabPlan, replaced: int, sides: tuple[bool, bool]
+) -> dict[str, Any]:
     g, cone = source.geometry, source.geometry.has_rows
     most = min(_LOOKED_AT, max(high - low for low, high in plan.bands), source.count)
     if cone:  # about the plane of the orbit
-        first = int(np.clip(round(-g.row_positions[0] / g.pitch[0]) - most // 2, 0, source.count - most))
+        first = int(
+            np.clip(round(-g.row_positions[0] / g.pitch[0]) - most // 2, 0, source.count - most)
+        )
     else:
         most -= 1 - most % 2
         first = source.count // 2 - most // 2
@@ -641,10 +759,17 @@ def _looked_at(source: ScanSlices, plan: SlabPlan, replaced: int, sides: tuple[b
         share = 100 * replaced / source.counts.numel()
         texts.insert(
             0,
-            f"{replaced} readings are such as no object can cause (dead cells, wrong gains, lost readings): "
+            f"{replaced} readings are such as no object can cause (dead cells, wrong gains, lost "
+            "readings): "
             f"{share:.2g} % of the readings were interpolated from their neighbours",
         )
     if any(sides) and not any("inside the object" in text for text in texts):
-        texts.append("the rows end inside the object above or below the middle: what lies beyond is continued as water")
+        texts.append(
+            "the rows end inside the object above or below the middle: what lies beyond is "
+            "continued as water"
+        )
     what = f"{'rows' if cone else 'slices'} {first} … {first + most - 1} of {source.count}"
-    return {"warnings": texts, "notes": [f"readings, rotation axis and edges were tested in {what}"]}
+    return {
+        "warnings": texts,
+        "notes": [f"readings, rotation axis and edges were tested in {what}"],
+    }

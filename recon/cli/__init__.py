@@ -1,9 +1,10 @@
 """Command line: ``torchpcct`` alone says where to begin.
 
-:mod:`~recon.cli.starting` has the first commands of a newcomer, :mod:`~recon.cli.scans` those that make scans and
-volumes, :mod:`~recon.cli.measuring` the measurement of methods and the studies, :mod:`~recon.cli.looking` what shows
-files, :mod:`~recon.cli.plaque` reads tissues,
-:mod:`~torchpcct.acquisition.config` reads what ``simulate`` is told, :mod:`~recon.cli.parsing` is what all share.
+:mod:`~recon.cli.starting` has the first commands of a newcomer, :mod:`~recon.cli.scans` those that
+make scans and volumes, :mod:`~recon.cli.measuring` the measurement of methods and the studies,
+:mod:`~recon.cli.looking` what shows files, :mod:`~recon.cli.plaque` reads tissues,
+:mod:`~torchpcct.acquisition.config` reads what ``simulate`` is told, :mod:`~recon.cli.parsing` is
+what all share.
 """
 
 from __future__ import annotations
@@ -26,7 +27,16 @@ from recon.cli.measuring import (
     add_study,
     add_verify,
 )
-from recon.cli.parsing import Commands, Ended, Parser, as_options, check_limits, ending_by_signals, is_path, saying
+from recon.cli.parsing import (
+    Commands,
+    Ended,
+    Parser,
+    as_options,
+    check_limits,
+    ending_by_signals,
+    is_path,
+    saying,
+)
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.plaque import add_plaque
@@ -40,13 +50,20 @@ __all__ = ["main"]
 
 _GROUPS = {
     "begin": (add_demo, add_doctor),
-    "simulate and reconstruct": (add_simulate, add_show_config, add_reconstruct, add_lower_dose, add_train),
+    "simulate and reconstruct": (
+        add_simulate,
+        add_show_config,
+        add_reconstruct,
+        add_lower_dose,
+        add_train,
+    ),
     "look": (add_view, add_info),
     "measure": (add_evaluate, add_show_task, add_plaque),
     "studies": (add_compare, add_dose_factor, add_hardcases, add_study, add_verify),
 }
 _BEGIN = """\
-torchpcct {version}: simulate a photon-counting CT scan, reconstruct it, measure how much dose a method really saves.
+torchpcct {version}: simulate a photon-counting CT scan, reconstruct it,
+measure how much dose a method really saves.
 
 A first look, 1 min      torchpcct demo
 Does all work here?      torchpcct doctor
@@ -66,15 +83,20 @@ def _parser() -> tuple[Parser, Commands, str]:
     """Parser, its commands, and what ``torchpcct`` alone says."""
     parser = Parser(
         prog="torchpcct",
-        description="Photon-counting CT: simulate, reconstruct, and measure what model-based reconstruction saves.",
+        description="Photon-counting CT: simulate, reconstruct, and measure what model-based "
+        "reconstruction saves.",
         epilog="commands and options by Tab, in bash:\n"
-        "  torchpcct --print-completion bash > ~/.local/share/bash-completion/completions/torchpcct\n",
+        "  torchpcct --print-completion bash > "
+        "~/.local/share/bash-completion/completions/torchpcct\n",
     )
     parser.add_argument("--version", action="version", version=f"torchpcct {__version__}")
     parser.add_argument(
-        "--print-completion", action=_Completion, choices=("bash", "zsh", "tcsh"), metavar="SHELL",
+        "--print-completion",
+        action=_Completion,
+        choices=("bash", "zsh", "tcsh"),
+        metavar="SHELL",
         help="print the completion of bash, zsh or tcsh (needs the extra completion)",
-    )  # fmt: skip
+    )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     groups, listing, width = [], [], shutil.get_terminal_size().columns - 2
     for title, adders in _GROUPS.items():
@@ -83,7 +105,10 @@ def _parser() -> tuple[Parser, Commands, str]:
             add(commands)
         added = commands._choices_actions[first:]
         groups.append(f"{title + ':':<25} {', '.join(a.dest for a in added)}")
-        rows = (textwrap.wrap(f"  {a.dest:<12} {a.help}", width, subsequent_indent=" " * 15) for a in added)
+        rows = (
+            textwrap.wrap(f"  {a.dest:<12} {a.help}", width, subsequent_indent=" " * 15)
+            for a in added
+        )
         listing += [f"{title}:", *itertools.chain(*rows), ""]
     parser.listing = "\n".join(listing)
     return parser, commands, _BEGIN.format(version=__version__, groups="\n".join(groups))
@@ -92,7 +117,9 @@ def _parser() -> tuple[Parser, Commands, str]:
 class _Completion(argparse.Action):
     """Print the completion of a shell, and end."""
 
-    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+    def __call__(
+        self, parser: Any, namespace: Any, values: Any, option_string: str | None = None
+    ) -> None:
         try:
             import shtab
         except ImportError:
@@ -106,9 +133,9 @@ class _Completion(argparse.Action):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit status: 0 done, 1 not written (a full disk) or, of ``doctor``, something is
-    broken, 2 refused input, 130 interrupted, 128 + N ended by signal N. Without a command it says where to begin,
-    which is no error."""
+    """Run a command; returns the exit status: 0 done, 1 not written (a full disk) or, of
+    ``doctor``, something is broken, 2 refused input, 130 interrupted, 128 + N ended by signal N.
+    Without a command it says where to begin, which is no error."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     speak_any_encoding()
     if words[:1] == ["train"]:
@@ -141,17 +168,24 @@ def _run(options: argparse.Namespace, parser: Parser) -> int:
     except WriteError as error:
         return _failed(options.command, progress, str(error), 1)
     except (ValueError, TypeError, OSError, ImportError, OverflowError, MemoryError) as error:
-        text = as_options(str(error), parser._actions) or "out of memory: use larger voxels or a smaller grid"
+        text = (
+            as_options(str(error), parser._actions)
+            or "out of memory: use larger voxels or a smaller grid"
+        )
         return _failed(options.command, progress, text, 2)
     except RuntimeError as error:
         if type(error).__name__ == "LeftOut":
             return _failed(options.command, progress, str(error), 1)
         if "no locator available" not in str(error):
             raise
-        text = "numba cannot keep compiled kernels: set NUMBA_CACHE_DIR to a folder that you can write"
+        text = (
+            "numba cannot keep compiled kernels: set NUMBA_CACHE_DIR to a folder that you can write"
+        )
         return _failed(options.command, progress, text, 2)
     except Ended as error:
-        return _failed(options.command, progress, f"{error}, nothing half written", 128 + error.number)
+        return _failed(
+            options.command, progress, f"{error}, nothing half written", 128 + error.number
+        )
     except KeyboardInterrupt:
         return _failed(options.command, progress, "interrupted, nothing half written", 130)
 

@@ -1,4 +1,5 @@
-"""What ``doctor`` looks at: the installation, the machine, and whether both compute what they should."""
+"""What ``doctor`` looks at: the installation, the machine, and whether both compute what they
+should."""
 
 from __future__ import annotations
 
@@ -50,7 +51,8 @@ def _versions() -> str:
         try:
             version = metadata.version(name)
             importlib.import_module(_MODULES.get(name, name))
-        except Exception as error:  # missing, or a binary of another machine: both are what is looked for
+        # missing, or a binary of another machine: both are what is looked for
+        except Exception as error:
             wrong.append(f"{name} does not load ({error})")
         else:
             found.append(f"{name} {version}")
@@ -78,27 +80,38 @@ def _extras() -> str:
     parts, wrong = [], []
     for extra, names in extras.items():
         missing = [name for name in names if name not in there]
-        parts.append(f"{extra} lacks {', '.join(missing)} (pip install 'torchpcct[{extra}]')" if missing else extra)
+        parts.append(
+            f"{extra} lacks {', '.join(missing)} (pip install 'torchpcct[{extra}]')"
+            if missing
+            else extra
+        )
         for name in (n for n in names if n in there):
             version, least = metadata.version(name), names[name]
             if name in faults:
                 wrong.append(
-                    f"{name} of {extra} does not load ({faults[name]}): pip install --force-reinstall '{name}'"
+                    f"{name} of {extra} does not load ({faults[name]}): pip install "
+                    f"--force-reinstall '{name}'"
                 )
             elif _numbers(version) < _numbers(least):
-                wrong.append(f"{name} {version} of {extra} is older than {least}: pip install '{name}>={least}'")
+                wrong.append(
+                    f"{name} {version} of {extra} is older than {least}: pip install "
+                    f"'{name}>={least}'"
+                )
     if wrong:
         raise ValueError("; ".join(wrong))
     return "; ".join(parts)
 
 
 def _faults(names: list[str]) -> dict[str, str]:
-    """Why installed packages do not load; in a process of its own, which a broken binary may end."""
+    """Why installed packages do not load; in a process of its own, which a broken binary may
+    end."""
     modules = {_MODULES.get(name, name).replace("-", "_"): name for name in names}
     faults: dict[str, str] = {}
     left = list(modules)
     while left:
-        done = subprocess.run([sys.executable, "-P", "-c", _LOAD, *left], capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", _LOAD, *left], capture_output=True, text=True, check=False
+        )
         told = dict(re.findall(r"^LOADED (\S+) (.*)$", done.stdout, re.MULTILINE))
         faults |= {modules[name]: said for name, said in told.items() if said != "loads"}
         left = [name for name in left if name not in told]
@@ -130,14 +143,19 @@ def _processor() -> str:
     import torch
     from llvmlite import binding
 
-    return f"{platform.machine()}, {binding.get_host_cpu_name()}, {torch.backends.cpu.get_cpu_capability()}"
+    return (
+        f"{platform.machine()}, {binding.get_host_cpu_name()}, "
+        f"{torch.backends.cpu.get_cpu_capability()}"
+    )
 
 
 def _gpu() -> str:
     import torch
 
     if not torch.cuda.is_available():
-        return f"none that torch can use (torch {torch.__version__}); everything runs on the processor"
+        return (
+            f"none that torch can use (torch {torch.__version__}); everything runs on the processor"
+        )
     if not _installed("triton"):
         raise ValueError("torch finds one, but the GPU kernels need triton: pip install triton")
     about = torch.cuda.get_device_properties(0)
@@ -154,15 +172,23 @@ def _cache() -> str:
     try:
         require_writable(folder)
     except OSError as error:
-        raise ValueError(f"{error.__cause__ or error}: set NUMBA_CACHE_DIR to a folder that you can write") from None
-    brief = " (while this process lives: set NUMBA_CACHE_DIR to a folder that lasts)" if is_temporary(folder) else ""
+        raise ValueError(
+            f"{error.__cause__ or error}: set NUMBA_CACHE_DIR to a folder that you can write"
+        ) from None
+    brief = (
+        " (while this process lives: set NUMBA_CACHE_DIR to a folder that lasts)"
+        if is_temporary(folder)
+        else ""
+    )
     return f"{folder}, writable, {len(list(folder.glob('*.nbc')))} compiled kernels{brief}"
 
 
 def _weights() -> str:
     from recon.mbir.mbir import Mbir
 
-    card = json.loads((resources.files("recon") / "mbir" / "weights" / "card.json").read_text(encoding="utf-8"))
+    card = json.loads(
+        (resources.files("recon") / "mbir" / "weights" / "card.json").read_text(encoding="utf-8")
+    )
     found = Mbir.load().weights_sha256
     if found != card["sha256_of_tensors"]:
         raise ValueError(f"sha256 {found}, their card says {card['sha256_of_tensors']}: {_AGAIN}")
@@ -174,7 +200,9 @@ def _adjoint() -> str:
 
     from torchpcct import ConeBeam, Projector, full_turn
 
-    projector = Projector(ConeBeam(full_turn(12), 626.0, 1098.0, 24, 8, 2.0), VolumeGrid((8, 20, 20), 1.2))
+    projector = Projector(
+        ConeBeam(full_turn(12), 626.0, 1098.0, 24, 8, 2.0), VolumeGrid((8, 20, 20), 1.2)
+    )
     draw = torch.Generator().manual_seed(0)
     x = torch.rand(8, 20, 20, generator=draw)
     forward = projector(x)
@@ -224,7 +252,11 @@ def outcomes() -> Iterator[tuple[str, bool, str]]:
         try:
             yield name, True, check()
         except metadata.PackageNotFoundError:
-            yield name, False, "runs from sources that are not installed: pip install -e . in their folder"
+            yield (
+                name,
+                False,
+                "runs from sources that are not installed: pip install -e . in their folder",
+            )
         except Exception as error:
             known = isinstance(error, ValueError)
             yield name, False, str(error) if known else f"{type(error).__name__}: {error}: {_AGAIN}"

@@ -34,7 +34,8 @@ _PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 _LEAST_HU = 20.0
 _SCALE_OF_CHANGES = 0.0, 200.0
 """Level and window in HU of what a drawn vessel has changed."""
-"""A volume whose values lie closer together is not in HU, whatever its file says (most do not say)."""
+"""A volume whose values lie closer together is not in HU, whatever its file says (most do not
+say)."""
 
 
 def _is_volume(path: Path) -> bool:
@@ -75,37 +76,67 @@ def _info(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         volume = Volume.load(path)
         values, length = volume.data.double(), length_of(volume.unit)
         about: dict[str, Any] = {
-            "kind": "volume", "shape": list(volume.grid.shape), f"spacing_{length}": list(volume.grid.spacing),
-            f"center_{length}": list(volume.grid.center), "unit": volume.unit, "lowest": float(values.min()),
-            "mean": float(values.mean()), "highest": float(values.max()), "report": dict(volume.report),
-        }  # fmt: skip
+            "kind": "volume",
+            "shape": list(volume.grid.shape),
+            f"spacing_{length}": list(volume.grid.spacing),
+            f"center_{length}": list(volume.grid.center),
+            "unit": volume.unit,
+            "lowest": float(values.min()),
+            "mean": float(values.mean()),
+            "highest": float(values.max()),
+            "report": dict(volume.report),
+        }
     else:
         scan = open_scan(path)
         about = {
-            "kind": "scan", "readings": list(scan.counts.shape), "geometry": geometry_values(scan.geometry),
-            "exposure_s": scan.exposure_s, "seed": scan.seed, "counting": scan.counting, "unit": scan.unit,
-            "windowed": scan.window is not None, "mean": float(scan.counts.mean()), "zero_share": scan.zero_fraction,
-            **({"lengths": "in pixels, the file does not know their size"} if scan.unit == "pixel^-1" else {}),
-            "dead_readings": dead_readings(repair_defects(scan)[0]), "info": dict(scan.info),
-        }  # fmt: skip
+            "kind": "scan",
+            "readings": list(scan.counts.shape),
+            "geometry": geometry_values(scan.geometry),
+            "exposure_s": scan.exposure_s,
+            "seed": scan.seed,
+            "counting": scan.counting,
+            "unit": scan.unit,
+            "windowed": scan.window is not None,
+            "mean": float(scan.counts.mean()),
+            "zero_share": scan.zero_fraction,
+            **(
+                {"lengths": "in pixels, the file does not know their size"}
+                if scan.unit == "pixel^-1"
+                else {}
+            ),
+            "dead_readings": dead_readings(repair_defects(scan)[0]),
+            "info": dict(scan.info),
+        }
     if arguments.json:
         print(as_json({"file": str(path), **about}))
         return
     for key in ("report", "info"):
         about.pop(key, None)
     print(
-        yaml.safe_dump({"file": str(path), **about}, sort_keys=False, allow_unicode=True, default_flow_style=None),
+        yaml.safe_dump(
+            {"file": str(path), **about},
+            sort_keys=False,
+            allow_unicode=True,
+            default_flow_style=None,
+        ),
         end="",
     )
 
 
 def add_info(commands: Commands) -> None:
     parser = command(
-        commands, "info", _info, "what a scan or volume file holds", "What a file holds.",
-        "torchpcct info scan.h5", "torchpcct info volume.nii.gz --json",
-    )  # fmt: skip
+        commands,
+        "info",
+        _info,
+        "what a scan or volume file holds",
+        "What a file holds.",
+        "torchpcct info scan.h5",
+        "torchpcct info volume.nii.gz --json",
+    )
     add_options(
-        parser, ("file", Path, "FILE", "scan or volume", {"read": True}), ("--json", bool, None, "everything, as JSON")
+        parser,
+        ("file", Path, "FILE", "scan or volume", {"read": True}),
+        ("--json", bool, None, "everything, as JSON"),
     )
 
 
@@ -116,7 +147,9 @@ def _view(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     if page and arguments.out is not None:
         raise ValueError("--html FILE or --out PATH: a page or a picture, one at a time")
     if page and (arguments.slice is not None or arguments.plane != "z"):
-        raise ValueError("--slice and --plane belong to a picture (--out); a page of --html shows all of them")
+        raise ValueError(
+            "--slice and --plane belong to a picture (--out); a page of --html shows all of them"
+        )
     arguments.out = arguments.html or arguments.out or Path(f"{without_ending(files[0])}.png")
     check_ending(arguments.out, (".html", ".htm") if page else _PICTURE_ENDINGS)
     check_output(arguments, _is_page if page else is_picture, *files)
@@ -124,14 +157,19 @@ def _view(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         if not file.exists():
             raise FileNotFoundError(f"no such file: {file}")
         if not _is_volume(file):
-            raise ValueError(f"{file} is a scan, no volume: torchpcct reconstruct it first, info says what it holds")
+            raise ValueError(
+                f"{file} is a scan, no volume: torchpcct reconstruct it first, info says what it "
+                "holds"
+            )
     from torchpcct.volume import Volume
 
     changes = [map_beside(file) for file in files] if page else []
     files = [*files, *(path for path in changes if path.exists() and path not in files)]
     volumes = [Volume.load(file) for file in files]
     scales = [
-        _SCALE_OF_CHANGES if file in changes else _grey_scale(v.data, arguments.level, arguments.window)
+        _SCALE_OF_CHANGES
+        if file in changes
+        else _grey_scale(v.data, arguments.level, arguments.window)
         for file, v in zip(files, volumes, strict=True)
     ]
     if page:
@@ -139,17 +177,25 @@ def _view(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 
         names = [without_ending(file) for file in files]
         labels = [n if names.count(n) == 1 else str(f) for n, f in zip(names, files, strict=True)]
-        shown = [(label, v, *scale) for label, v, scale in zip(labels, volumes, scales, strict=True)]
+        shown = [
+            (label, v, *scale) for label, v, scale in zip(labels, volumes, scales, strict=True)
+        ]
         with atomic_write(arguments.out) as part:
             part.write_text(viewer_page(shown, ", ".join(labels)), encoding="utf-8")
         size = arguments.out.stat().st_size / 1e6
-        print(f"{arguments.out}: {', '.join(labels)}, {size:.1f} MB; open it in a browser (no network is needed)")
+        print(
+            f"{arguments.out}: {', '.join(labels)}, {size:.1f} MB; open it in a browser (no "
+            "network is needed)"
+        )
         return
     level, width = scales[0]
     figure, index = _draw_slice(volumes[0], arguments.plane, arguments.slice, level, width)
     with atomic_write(arguments.out) as part:
         figure.savefig(part)
-    print(f"{arguments.out}: slice {index} along {arguments.plane}, level {level:.4g}, window {width:.4g}")
+    print(
+        f"{arguments.out}: slice {index} along {arguments.plane}, level {level:.4g}, window "
+        f"{width:.4g}"
+    )
 
 
 def _is_page(path: Path) -> bool:
@@ -158,7 +204,9 @@ def _is_page(path: Path) -> bool:
         return b'content="torchpcct view"' in file.read(512)
 
 
-def _draw_slice(volume: Volume, plane: str, index: int | None, level: float, width: float) -> tuple[Any, int]:
+def _draw_slice(
+    volume: Volume, plane: str, index: int | None, level: float, width: float
+) -> tuple[Any, int]:
     """Figure of a slice across the axis ``plane``, and its index (the middle, if None is given)."""
     import numpy as np
     from matplotlib.figure import Figure
@@ -167,7 +215,9 @@ def _draw_slice(volume: Volume, plane: str, index: int | None, level: float, wid
     axis = "zyx".index(plane)
     index = data.shape[axis] // 2 if index is None else index
     if not 0 <= index < data.shape[axis]:
-        raise ValueError(f"--slice must lie in 0 … {data.shape[axis] - 1} along {plane}, got {index}")
+        raise ValueError(
+            f"--slice must lie in 0 … {data.shape[axis] - 1} along {plane}, got {index}"
+        )
     axes = volume.grid.axes if volume.grid.ndim == 3 else (np.zeros(1), *volume.grid.axes)
     names = [n for n in (0, 1, 2) if n != axis]
     across, up = axes[names[1]], axes[names[0]]
@@ -175,17 +225,26 @@ def _draw_slice(volume: Volume, plane: str, index: int | None, level: float, wid
     panel = figure.subplots()
     low, high = level - width / 2, level + width / 2
     step = [float(a[1] - a[0]) if a.size > 1 else 1.0 for a in (across, up)]
-    extent = (across[0] - step[0] / 2, across[-1] + step[0] / 2, up[0] - step[1] / 2, up[-1] + step[1] / 2)
+    extent = (
+        across[0] - step[0] / 2,
+        across[-1] + step[0] / 2,
+        up[0] - step[1] / 2,
+        up[-1] + step[1] / 2,
+    )
     image = data.select(axis, index).numpy()
     shown = panel.imshow(image, cmap="gray", vmin=low, vmax=high, origin="lower", extent=extent)
-    panel.set(xlabel=f"{'zyx'[names[1]]} / mm", ylabel=f"{'zyx'[names[0]]} / mm",
-              title=f"{plane} = {axes[axis][index]:.2f} mm")  # fmt: skip
+    panel.set(
+        xlabel=f"{'zyx'[names[1]]} / mm",
+        ylabel=f"{'zyx'[names[0]]} / mm",
+        title=f"{plane} = {axes[axis][index]:.2f} mm",
+    )
     figure.colorbar(shown, ax=panel, label=volume.unit)
     return figure, index
 
 
 def _grey_scale(values: Any, level: float | None, window: float | None) -> tuple[float, float]:
-    """Level and window: what was asked for; else 40 and 400 for HU, the values' own range for anything else."""
+    """Level and window: what was asked for; else 40 and 400 for HU, the values' own range for
+    anything else."""
     import numpy as np
 
     low, high = np.quantile(values[..., :: max(1, values.numel() // 2**22)].numpy(), [0.001, 0.999])
@@ -197,16 +256,27 @@ def _grey_scale(values: Any, level: float | None, window: float | None) -> tuple
 
 def add_view(commands: Commands) -> None:
     parser = command(
-        commands, "view", _view, "volumes in a page for the browser, or a slice as a picture",
-        "Draw a slice of a volume, or, with --html, make a page that shows volumes side by side in any "
-        "browser: three planes, wheel through the slices, window by dragging, one cursor in all volumes, values and "
+        commands,
+        "view",
+        _view,
+        "volumes in a page for the browser, or a slice as a picture",
+        "Draw a slice of a volume, or, with --html, make a page that shows volumes side by side "
+        "in any "
+        "browser: three planes, wheel through the slices, window by dragging, one cursor in all "
+        "volumes, values and "
         "ROIs. The page is one file and needs no network.",
         "torchpcct view fbp.nii.gz mbir.nii.gz --level 150 --window 600 --html view.html",
         "torchpcct view mbir.nii.gz --plane x --slice 18 --out sagittal.png",
-    )  # fmt: skip
+    )
     add_options(
         parser,
-        ("files", Path, "VOLUME", ".nii, .nii.gz, .mha, .h5, .dcm or a DICOM folder", {"nargs": "+"}),
+        (
+            "files",
+            Path,
+            "VOLUME",
+            ".nii, .nii.gz, .mha, .h5, .dcm or a DICOM folder",
+            {"nargs": "+"},
+        ),
         ("--html", Path, "FILE", "page to write (.html), of one volume or several"),
         ("--out", Path, "PATH", "picture: .png, .pdf or .svg (default VOLUME.png)"),
         (
@@ -227,7 +297,19 @@ def add_view(commands: Commands) -> None:
     )
     add_options(
         parser,
-        ("--plane", str, None, "axis across the slice (default z)", {"choices": ("z", "y", "x"), "default": "z"}),
-        ("--slice", int, "K", "index along it (default: the middle)", {"limits": {"low": 0, "high": MANY}}),
+        (
+            "--plane",
+            str,
+            None,
+            "axis across the slice (default z)",
+            {"choices": ("z", "y", "x"), "default": "z"},
+        ),
+        (
+            "--slice",
+            int,
+            "K",
+            "index along it (default: the middle)",
+            {"limits": {"low": 0, "high": MANY}},
+        ),
         group="the picture",
     )

@@ -1,5 +1,5 @@
-"""The commands that measure: ``evaluate``, ``dose-factor``, ``show-task``; ``compare``, ``hardcases``, ``study``,
-``verify``."""
+"""The commands that measure: ``evaluate``, ``dose-factor``, ``show-task``; ``compare``,
+``hardcases``, ``study``, ``verify``."""
 
 from __future__ import annotations
 
@@ -46,15 +46,38 @@ __all__ = [
 ]
 
 _STUDY_TASKS = (
-    "plaque", "half_contrast", "half_size_core", "two_cores", "small_vessel", "tilted", "in_plane", "curved",
-    "muscle_sphere", "line_pairs_10", "line_pairs_14", "rod",
-)  # fmt: skip
+    "plaque",
+    "half_contrast",
+    "half_size_core",
+    "two_cores",
+    "small_vessel",
+    "tilted",
+    "in_plane",
+    "curved",
+    "muscle_sphere",
+    "line_pairs_10",
+    "line_pairs_14",
+    "rod",
+)
 _STUDY_METHODS = (
-    "fbp:soft", "fbp:standard", "fbp:detail", "gaussian@fbp:standard", "perona_malik@fbp:standard",
-    "nlm@fbp:standard", "tv@fbp:standard", "bilateral@fbp:detail", "pwls", "mbir:prior=bilateral",
-    "mbir:fidelity=0", "mbir", "mbir:fidelity=1", "mbir:vessel", "mbir:tissues",
-)  # fmt: skip
-"""Of ``dose-factor``: every method of the package, and each filter on the kernel on which it has the least error."""
+    "fbp:soft",
+    "fbp:standard",
+    "fbp:detail",
+    "gaussian@fbp:standard",
+    "perona_malik@fbp:standard",
+    "nlm@fbp:standard",
+    "tv@fbp:standard",
+    "bilateral@fbp:detail",
+    "pwls",
+    "mbir:prior=bilateral",
+    "mbir:fidelity=0",
+    "mbir",
+    "mbir:fidelity=1",
+    "mbir:vessel",
+    "mbir:tissues",
+)
+"""Of ``dose-factor``: every method of the package, and each filter on the kernel on which it has
+the least error."""
 
 
 def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
@@ -77,7 +100,9 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         return
     for name in ("region", "reference", "voxel", "extent", "center"):
         if getattr(arguments, name, None) is not None:
-            raise ValueError(f"--{name} is of measured scans and volumes: give it with --scans or --volumes")
+            raise ValueError(
+                f"--{name} is of measured scans and volumes: give it with --scans or --volumes"
+            )
     n = arguments.realisations if arguments.n is None else arguments.n
     methods = [*(arguments.method or []), *map(_denoiser, arguments.denoiser or [])]
     if any(map(names_module, [*methods, *_reported(out)])):
@@ -90,12 +115,17 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
             print(_planned_export(tasks, arguments.exposures_s, n, arguments.export))
             return
         written = export_scans(
-            tasks, arguments.export, exposures_s=arguments.exposures_s, n=n,
-            seed=arguments.seed, progress=progress,
-        )  # fmt: skip
+            tasks,
+            arguments.export,
+            exposures_s=arguments.exposures_s,
+            n=n,
+            seed=arguments.seed,
+            progress=progress,
+        )
         progress.close()
         print(
-            f"{len(written)} scans in {arguments.export}. Save their volumes in HU, on the grid of each folder's "
+            f"{len(written)} scans in {arguments.export}. Save their volumes in HU, on the grid "
+            "of each folder's "
             "grid.json, under the same names in OTHER/TASK, as this does:\n"
             f"  torchpcct reconstruct {arguments.export}/{written[0].parent.name}/*.h5 --out OTHER/"
             f"{written[0].parent.name}\n"
@@ -108,9 +138,14 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     methods = [*before, *(name for name in methods if name not in before)]
     with executing(arguments, out):
         found = evaluate(
-            tasks, methods, exposures_s=arguments.exposures_s, n=n, seed=arguments.seed,
-            folder=out / "pieces", progress=progress,
-        )  # fmt: skip
+            tasks,
+            methods,
+            exposures_s=arguments.exposures_s,
+            n=n,
+            seed=arguments.seed,
+            folder=out / "pieces",
+            progress=progress,
+        )
     progress.close()
     if found is None:
         return
@@ -136,7 +171,10 @@ def _planned_export(tasks: list[str], exposures_s: Any, n: int, folder: Path) ->
     for task in map(read_task, tasks):
         exposures = exposures_s or task.exposures_s
         times = ", ".join(f"{e:g}" for e in exposures)
-        lines.append(f"{folder / task.name}: {2 * (n + 1) * len(exposures)} scans at {times} s, and grid.json")
+        lines.append(
+            f"{folder / task.name}: {2 * (n + 1) * len(exposures)} scans at {times} s, and "
+            "grid.json"
+        )
     return "\n".join(lines)
 
 
@@ -145,16 +183,23 @@ def _measured(arguments: argparse.Namespace, out: Path) -> None:
     from recon.evaluate.report import measured_text, save_measured
 
     of_tasks = {
-        "--task": arguments.task, "--exposure": arguments.exposures_s, "--export": arguments.export,
-        "--workers": arguments.workers, "--dry-run": arguments.dry_run,
-    }  # fmt: skip
+        "--task": arguments.task,
+        "--exposure": arguments.exposures_s,
+        "--export": arguments.export,
+        "--workers": arguments.workers,
+        "--dry-run": arguments.dry_run,
+    }
     for flag, value in of_tasks.items():
         if value:
-            raise ValueError(f"{flag} is of simulated tasks: leave it out with --scans and --volumes")
+            raise ValueError(
+                f"{flag} is of simulated tasks: leave it out with --scans and --volumes"
+            )
     if arguments.scans and arguments.volumes:
         raise ValueError("give --scans or --volumes, not both")
     rows, unit, reference = _scans(arguments) if arguments.scans else _volumes(arguments)
-    files = save_measured(rows, unit, reference, out, f"torchpcct {shlex.join(arguments.command_line)}")
+    files = save_measured(
+        rows, unit, reference, out, f"torchpcct {shlex.join(arguments.command_line)}"
+    )
     print(measured_text(rows, unit, reference))
     print(f"all figures and the page: {', '.join(map(str, files))}")
 
@@ -167,30 +212,47 @@ def _scans(arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], str, st
     from torchpcct.formats.scans import open_scan
 
     if arguments.reference is not None:
-        raise ValueError("--reference names one of the --volumes; of --scans it is FBP with the kernel ram-lak")
-    methods = [*(arguments.method or []), *map(_denoiser, arguments.denoiser or [])] or list(arguments.methods)
+        raise ValueError(
+            "--reference names one of the --volumes; of --scans it is FBP with the kernel ram-lak"
+        )
+    methods = [*(arguments.method or []), *map(_denoiser, arguments.denoiser or [])] or list(
+        arguments.methods
+    )
     if any(map(names_module, methods)):
         find_modules_here()
     scans = [open_scan(path) for path in arguments.scans]
-    grid = VolumeGrid.of(scans[0], voxel=arguments.voxel, extent=arguments.extent, center=arguments.center)
+    grid = VolumeGrid.of(
+        scans[0], voxel=arguments.voxel, extent=arguments.extent, center=arguments.center
+    )
     region = _region(arguments.region, grid)
     found = evaluate_scans(
-        scans, grid, methods, region, n=1 if arguments.n is None else arguments.n, seed=arguments.seed
+        scans,
+        grid,
+        methods,
+        region,
+        n=1 if arguments.n is None else arguments.n,
+        seed=arguments.seed,
     )
     return found, scans[0].unit, "fbp:ram-lak"
 
 
 def _volumes(arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], str, str]:
-    """The same of volumes of two scans of one object that other programs made, one folder a scan."""
+    """The same of volumes of two scans of one object that other programs made, one folder a
+    scan."""
     from recon.evaluate.methods import same_grid, volume_files
     from recon.evaluate.without_truth import evaluate_volumes
     from torchpcct.volume import Volume
 
     for flag, value in (("--method", arguments.method), ("--denoiser", arguments.denoiser)):
         if value:
-            raise ValueError(f"{flag} is of --scans: --volumes takes what lies in the two folders, a file a method")
+            raise ValueError(
+                f"{flag} is of --scans: --volumes takes what lies in the two folders, a file a "
+                "method"
+            )
     if arguments.n is not None:
-        raise ValueError("--n is of --scans: two folders of volumes hold one pair of noise realisations")
+        raise ValueError(
+            "--n is of --scans: two folders of volumes hold one pair of noise realisations"
+        )
     for name in ("voxel", "extent", "center"):
         if getattr(arguments, name) is not None:
             raise ValueError(f"--{name} is of --scans: volumes say themselves where they lie")
@@ -198,12 +260,15 @@ def _volumes(arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], str, 
     reference = arguments.reference or "fbp"
     for folder in (first, second):
         if not folder.is_dir():
-            raise ValueError(f"{folder} is no folder: --volumes takes two, with one volume a method in each")
+            raise ValueError(
+                f"{folder} is no folder: --volumes takes two, with one volume a method in each"
+            )
     stems = [volume_files(folder) for folder in (first, second)]
     names = [name for name in stems[0] if name in stems[1]]
     if reference not in names:
         raise ValueError(
-            f"{first} and {second} hold {', '.join(names) or 'no volumes of one name'}: --reference names the one of a "
+            f"{first} and {second} hold {', '.join(names) or 'no volumes of one name'}: "
+            "--reference names the one of a "
             "linear method that has smoothed nothing (FBP, kernel ram-lak)"
         )
     pairs = {name: [Volume.load(s[name]) for s in stems] for name in names}
@@ -211,19 +276,26 @@ def _volumes(arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], str, 
     for name, both in pairs.items():
         if any(not same_grid(v.grid, grid) or v.unit != unit for v in both):
             raise ValueError(
-                f"{name} lies on another grid or has another unit than {reference}: {both[0].grid}, {grid}"
+                f"{name} lies on another grid or has another unit than {reference}: "
+                f"{both[0].grid}, {grid}"
             )
     data = {name: [v.data for v in both] for name, both in pairs.items()}
     base = data.pop(reference)
     cells = _cells(stems[0][reference])
-    found = evaluate_volumes(data, base, grid.spacing, _region(arguments.region, grid), cells_mm=cells)
+    found = evaluate_volumes(
+        data, base, grid.spacing, _region(arguments.region, grid), cells_mm=cells
+    )
     return found, unit, reference
 
 
 def _cells(path: Path) -> list[float] | None:
-    """What ``reconstruct`` wrote beside a volume of the detector's cells at the axis, mm; None: nothing."""
+    """What ``reconstruct`` wrote beside a volume of the detector's cells at the axis, mm; None:
+    nothing."""
     try:
-        return [float(c) for c in json.loads(Path(f"{path}.json").read_text(encoding="utf-8"))["cells_mm"]]
+        return [
+            float(c)
+            for c in json.loads(Path(f"{path}.json").read_text(encoding="utf-8"))["cells_mm"]
+        ]
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -240,12 +312,16 @@ def _region(text: str | None, grid: VolumeGrid) -> Any:
     mask: Any = np.zeros(grid.shape, bool)
     if not Path(text).exists():
         try:
-            parts = [slice(*(int(end) if end else None for end in part.split(":"))) for part in text.split(",")]
+            parts = [
+                slice(*(int(end) if end else None for end in part.split(":")))
+                for part in text.split(",")
+            ]
         except (ValueError, TypeError):
             parts = []
         if len(parts) != len(grid.shape):
             raise ValueError(
-                f"--region {text}: neither a file nor ranges of voxels, Z0:Z1,Y0:Y1,X0:X1, of {grid.shape} voxels"
+                f"--region {text}: neither a file nor ranges of voxels, Z0:Z1,Y0:Y1,X0:X1, of "
+                f"{grid.shape} voxels"
             )
         mask[tuple(parts)] = True
     else:
@@ -277,15 +353,19 @@ def _show_task(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     print(task_text(arguments.name), end="")
 
 
-# --- studies -----------------------------------------------------------------------------------------------------
+# --- studies --------------------------------------------------------------------------------------
 
 
-def _run_study(name: str, settings: Any, arguments: argparse.Namespace, progress: ProgressBars) -> None:
+def _run_study(
+    name: str, settings: Any, arguments: argparse.Namespace, progress: ProgressBars
+) -> None:
     """Run a study of the registry, save and print its report."""
     folder = arguments.out or Path("out") / name
     require_writable(folder)
     names = (name, registry.folder(name).replace("_", "-"))
-    check_results(arguments, folder, lambda report: report.get("study") in names, "report.*", "*.png")
+    check_results(
+        arguments, folder, lambda report: report.get("study") in names, "report.*", "*.png"
+    )
     from recon.evaluate.store import Pieces  # loads torch
 
     start = time.perf_counter()
@@ -303,7 +383,9 @@ def _run_study(name: str, settings: Any, arguments: argparse.Namespace, progress
 
 def _study(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     name, changes = arguments.name, arguments.changes
-    settings = registry.build_settings(name, quick=arguments.quick, seed=arguments.seed, changes=changes)
+    settings = registry.build_settings(
+        name, quick=arguments.quick, seed=arguments.seed, changes=changes
+    )
     _run_study(name, settings, arguments, progress)
 
 
@@ -337,10 +419,16 @@ def _verify(arguments: argparse.Namespace, progress: ProgressBars) -> None:
                 with atomic_write(root / name) as part:
                     part.write_text(text, encoding="utf-8")
     outcome = "say what the results say" if not stale else f"rendered: {', '.join(stale)}"
-    print(outcome if arguments.write or not stale else f"stale: {', '.join(stale)} (--write renders them)")
+    print(
+        outcome
+        if arguments.write or not stale
+        else f"stale: {', '.join(stale)} (--write renders them)"
+    )
     changed = []
     for name in arguments.again:
-        committed = json.loads((root / "notebooks" / registry.folder(name) / "report.json").read_text(encoding="utf-8"))
+        committed = json.loads(
+            (root / "notebooks" / registry.folder(name) / "report.json").read_text(encoding="utf-8")
+        )
         settings = registry.part(name).Settings.of(committed["settings"])
         again = json.loads(registry.run(name, settings, progress).json)
         found = list(results.differences(committed, again))
@@ -348,10 +436,12 @@ def _verify(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         print("\n".join([f"{name}: {len(found)} figures differ from the committed ones", *found]))
         changed += found
     if (stale and not arguments.write) or changed:
-        raise ValueError("README.md, notebooks/RESULTS.md and the committed reports do not agree: see above")
+        raise ValueError(
+            "README.md, notebooks/RESULTS.md and the committed reports do not agree: see above"
+        )
 
 
-# --- parsing ------------------------------------------------------------------------------------------------------
+# --- parsing --------------------------------------------------------------------------------------
 
 
 _METHODS_TEXT = """\
@@ -369,46 +459,108 @@ REALISATIONS = {"low": 8, "high": MANY}
 
 def add_evaluate(commands: Commands) -> None:
     parser = command(
-        commands, "evaluate", _evaluate, "how much dose does a method save at a task?",
-        "Measure reconstruction methods, yours too, at tasks, ready or yours, on the same noise realisations: dose "
-        "factors with intervals beside the limit of the data, noise, error, contrast, detectability, pictures. "
-        "Finished pieces are kept in the folder: the same command goes on after an interruption, and a second one with "
+        commands,
+        "evaluate",
+        _evaluate,
+        "how much dose does a method save at a task?",
+        "Measure reconstruction methods, yours too, at tasks, ready or yours, on the same noise "
+        "realisations: dose "
+        "factors with intervals beside the limit of the data, noise, error, contrast, "
+        "detectability, pictures. "
+        "Finished pieces are kept in the folder: the same command goes on after an interruption, "
+        "and a second one with "
         "more methods computes only those.",
         "torchpcct evaluate --task nodule --method mbir --n 20",
-        "torchpcct evaluate --task my.yaml --method mylab.nets:reconstruct --denoiser mylab.nets:denoise@fbp:detail",
+        "torchpcct evaluate --task my.yaml --method mylab.nets:reconstruct --denoiser "
+        "mylab.nets:denoise@fbp:detail",
         before=_METHODS_TEXT,
         out="folder for report.md, .json, .csv, .html and pictures (default out/evaluate)",
-    )  # fmt: skip
+    )
     parser.set_defaults(tasks=("plaque",), methods=("fbp:soft", "bilateral@fbp:detail", "mbir"))
     _add_common(parser, n=20)
     add_options(
         parser,
-        ("--scans", Path, "FILE", "measured scans instead of tasks: two of one object, or one, which is halved; noise "
-         "at equal resolution", {"nargs": "+", "read": True}),
-        ("--volumes", Path, "FOLDER", "volumes of two scans of one object instead of tasks: in each folder one file "
-         "per method, of the same name", {"nargs": 2, "read": True}),
-        ("--reference", str, "NAME", "with --volumes: the one by a linear method that smoothed nothing (default fbp)"),
-        ("--region", str, "MASK", "where noise is measured: a volume that is not 0 there, or voxels "
-         "Z0:Z1,Y0:Y1,X0:X1 (default: everywhere)"),
-        ("--voxel", float, "MM", "with --scans: voxel size (default: the detector's)", {"limits": LENGTH}),
-        ("--extent", float, "MM", "with --scans: of the volume, Z Y X", {"nargs": "+", "limits": LENGTH}),
-        ("--center", float, "MM", "with --scans: of the volume, Z Y X", {"nargs": "+", "limits": PLACE}),
+        (
+            "--scans",
+            Path,
+            "FILE",
+            "measured scans instead of tasks: two of one object, or one, which is halved; noise "
+            "at equal resolution",
+            {"nargs": "+", "read": True},
+        ),
+        (
+            "--volumes",
+            Path,
+            "FOLDER",
+            "volumes of two scans of one object instead of tasks: in each folder one file "
+            "per method, of the same name",
+            {"nargs": 2, "read": True},
+        ),
+        (
+            "--reference",
+            str,
+            "NAME",
+            "with --volumes: the one by a linear method that smoothed nothing (default fbp)",
+        ),
+        (
+            "--region",
+            str,
+            "MASK",
+            "where noise is measured: a volume that is not 0 there, or voxels "
+            "Z0:Z1,Y0:Y1,X0:X1 (default: everywhere)",
+        ),
+        (
+            "--voxel",
+            float,
+            "MM",
+            "with --scans: voxel size (default: the detector's)",
+            {"limits": LENGTH},
+        ),
+        (
+            "--extent",
+            float,
+            "MM",
+            "with --scans: of the volume, Z Y X",
+            {"nargs": "+", "limits": LENGTH},
+        ),
+        (
+            "--center",
+            float,
+            "MM",
+            "with --scans: of the volume, Z Y X",
+            {"nargs": "+", "limits": PLACE},
+        ),
         group="measured scans and volumes, of which nobody knows the truth",
-    )  # fmt: skip
-    add_options(parser, ("--export", Path, "FOLDER", "write the noisy scans for another program instead of evaluating"))
+    )
+    add_options(
+        parser,
+        (
+            "--export",
+            Path,
+            "FOLDER",
+            "write the noisy scans for another program instead of evaluating",
+        ),
+    )
 
 
 def add_dose_factor(commands: Commands) -> None:
     parser = command(
-        commands, "dose-factor", _evaluate, "the whole measurement: every method of the package at every plaque task",
-        "evaluate with the methods of this package, the simple filters among them, at the paper's plaque, its "
-        "variants, vessels of other directions, a sphere in muscle, line pairs and a low-contrast rod, with 200 "
+        commands,
+        "dose-factor",
+        _evaluate,
+        "the whole measurement: every method of the package at every plaque task",
+        "evaluate with the methods of this package, the simple filters among them, at the paper's "
+        "plaque, its "
+        "variants, vessels of other directions, a sphere in muscle, line pairs and a low-contrast "
+        "rod, with 200 "
         "realisations: hours on two cores, kept piece by piece.",
         "torchpcct dose-factor --task plaque --method mbir --method fbp:soft --n 40",
         before=_METHODS_TEXT,
         out="folder for report.md, .json, .csv, .html and pictures (default out/dose-factor)",
-    )  # fmt: skip
-    parser.set_defaults(tasks=_STUDY_TASKS, methods=_STUDY_METHODS, scans=None, volumes=None, export=None)
+    )
+    parser.set_defaults(
+        tasks=_STUDY_TASKS, methods=_STUDY_METHODS, scans=None, volumes=None, export=None
+    )
     _add_common(parser, n=200)
 
 
@@ -419,32 +571,56 @@ def _add_common(parser: Parser, n: int) -> None:
         parser,
         ("--task", str, "TASK", "name (see show-task) or YAML file, repeatable", many),
         ("--method", str, "METHOD", "see below (repeatable)", many),
-        ("--denoiser", str, "FUNCTION@BASE", "function of (volume) or (volume, sigma), HU, after BASE", many),
+        (
+            "--denoiser",
+            str,
+            "FUNCTION@BASE",
+            "function of (volume) or (volume, sigma), HU, after BASE",
+            many,
+        ),
         ("--exposure", float, "S", "in s (default: those of each task)", exposures),
     )
     add_execution(parser)
     parser.set_defaults(realisations=n)
-    add_options(parser, ("--n", int, None, f"noise realisations, at least 8 (default {n})", {"limits": REALISATIONS}))
+    add_options(
+        parser,
+        (
+            "--n",
+            int,
+            None,
+            f"noise realisations, at least 8 (default {n})",
+            {"limits": REALISATIONS},
+        ),
+    )
 
 
 def add_show_task(commands: Commands) -> None:
     parser = command(
-        commands, "show-task", _show_task, "print a ready task as YAML; without a name list them",
+        commands,
+        "show-task",
+        _show_task,
+        "print a ready task as YAML; without a name list them",
         "Print a ready task as YAML, to copy and change. Without a name: all of them.",
         "torchpcct show-task nodule > mine.yaml",
-    )  # fmt: skip
+    )
     add_options(parser, ("name", str, "NAME", "", {"nargs": "?"}))
 
 
 def add_compare(commands: Commands) -> None:
     parser = command(
-        commands, "compare", _own_study, registry.STUDIES["compare"],
-        "Simulate the paper's plaque scan at full size, reconstruct it by FBP, PWLS, the best simple filter and MBIR "
-        "on the same noise realisations at 1× and 5.7× dose, and print what dose each saves. After an interruption the "
+        commands,
+        "compare",
+        _own_study,
+        registry.STUDIES["compare"],
+        "Simulate the paper's plaque scan at full size, reconstruct it by FBP, PWLS, the best "
+        "simple filter and MBIR "
+        "on the same noise realisations at 1× and 5.7× dose, and print what dose each saves. "
+        "After an interruption the "
         "same command goes on.",
-        "torchpcct compare --quick", "torchpcct compare --n 200 --methods fbp:soft pwls mbir:fidelity=1",
+        "torchpcct compare --quick",
+        "torchpcct compare --n 200 --methods fbp:soft pwls mbir:fidelity=1",
         out="folder for report.html, .md, .json and two pictures (default out/compare)",
-    )  # fmt: skip
+    )
     add_options(
         parser,
         ("--n", int, "N", "realisations, at least 8 (default 16)", {"limits": REALISATIONS}),
@@ -456,18 +632,29 @@ def add_compare(commands: Commands) -> None:
 
 def add_hardcases(commands: Commands) -> None:
     parser = command(
-        commands, "hardcases", _own_study, registry.STUDIES["hardcases"],
-        "Break the plaque's scan in many ways, reconstruct what is left by every method, and print the error, what was "
+        commands,
+        "hardcases",
+        _own_study,
+        registry.STUDIES["hardcases"],
+        "Break the plaque's scan in many ways, reconstruct what is left by every method, and "
+        "print the error, what was "
         "said, and whether it was wrong without a warning.",
-        "torchpcct hardcases --quick", "torchpcct hardcases --methods fbp pwls --views 246",
+        "torchpcct hardcases --quick",
+        "torchpcct hardcases --methods fbp pwls --views 246",
         out="folder for report.html, .md, .json and the figure (default out/hardcases)",
-    )  # fmt: skip
+    )
     add_options(
         parser,
         ("--quick", bool, None, "an eighth of the views, by FBP alone"),
         ("--methods", str, "M", "fbp pwls mbir (default: all)", {"nargs": "+"}),
         ("--cases", str, "NAME", "only these cases", {"nargs": "+"}),
-        ("--views", int, "N", "views of the scan (default 360)", {"limits": {"low": 120, "high": MANY}}),
+        (
+            "--views",
+            int,
+            "N",
+            "views of the scan (default 360)",
+            {"limits": {"low": 120, "high": MANY}},
+        ),
     )
     add_execution(parser)
 
@@ -475,12 +662,18 @@ def add_hardcases(commands: Commands) -> None:
 def add_study(commands: Commands) -> None:
     listed = "".join(f"  {name:<12} {text}\n" for name, text in registry.STUDIES.items())
     parser = command(
-        commands, "study", _study, "any study of the paper by its name; torchpcct study --help lists them",
-        "Run a study of the paper at full scale and print its figures beside the published ones. After an interruption "
+        commands,
+        "study",
+        _study,
+        "any study of the paper by its name; torchpcct study --help lists them",
+        "Run a study of the paper at full scale and print its figures beside the published ones. "
+        "After an interruption "
         "the same command goes on.",
-        "torchpcct study noise --quick", "torchpcct study motion --set thinning=4", before=f"studies:\n{listed}\n",
+        "torchpcct study noise --quick",
+        "torchpcct study motion --set thinning=4",
+        before=f"studies:\n{listed}\n",
         out="folder for report.html, .md, .json and the figures (default out/NAME)",
-    )  # fmt: skip
+    )
     add_options(parser, ("name", str, "NAME", "of the study"))
     add_execution(parser)
     changes = {"dest": "changes", "action": "append", "default": []}
@@ -493,15 +686,32 @@ def add_study(commands: Commands) -> None:
 
 def add_verify(commands: Commands) -> None:
     parser = command(
-        commands, "verify", _verify, "do README and RESULTS.md say what the committed reports say?",
-        "Render the results again from the committed reports (notebooks/results.template.md) and compare; "
+        commands,
+        "verify",
+        _verify,
+        "do README and RESULTS.md say what the committed reports say?",
+        "Render the results again from the committed reports (notebooks/results.template.md) and "
+        "compare; "
         "compute studies again if asked.",
-        "torchpcct verify --write", "torchpcct verify --again phantom",
-    )  # fmt: skip
+        "torchpcct verify --write",
+        "torchpcct verify --again phantom",
+    )
     parser.set_defaults(no_progress=False)
     add_options(
         parser,
-        ("--root", Path, None, "folder of the repository (default: this one)", {"default": Path(), "read": True}),
+        (
+            "--root",
+            Path,
+            None,
+            "folder of the repository (default: this one)",
+            {"default": Path(), "read": True},
+        ),
         ("--write", bool, None, "write what is rendered"),
-        ("--again", str, "STUDY", "compute these studies again, in full", {"nargs": "*", "default": []}),
+        (
+            "--again",
+            str,
+            "STUDY",
+            "compute these studies again, in full",
+            {"nargs": "*", "default": []},
+        ),
     )

@@ -61,7 +61,8 @@ Commands = Any
 """What ``add_subparsers`` gives; argparse does not publish its type."""
 
 
-_COMMON, _SEED = "common options", {"low": 0, "high": 2**62}
+_COMMON = "common options"
+_SEED = {"low": 0, "high": 2**62}
 MOST = 4096
 """More processes or threads than a machine has use for."""
 MANY = 10**6
@@ -69,12 +70,14 @@ MANY = 10**6
 LENGTH: dict[str, Any] = {"positive": True, "high": 1e12, "unit": "mm"}
 EXPOSURE: dict[str, Any] = {"positive": True, "high": 1e6, "unit": "s"}
 PLACE: dict[str, Any] = {"low": -1e12, "high": 1e12, "unit": "mm"}
-"""Limits of lengths and positions: scans of any unit of length pass, slips of a power of ten by far do not."""
+"""Limits of lengths and positions: scans of any unit of length pass, slips of a power of ten by
+far do not."""
 FORCE = ("--force", bool, None, "replace a file that another command or software has made")
 
 
 class _Help(argparse.HelpFormatter):
-    """Wraps descriptions, and leaves texts that have lines of their own (examples, lists) as they are."""
+    """Wraps descriptions, and leaves texts that have lines of their own (examples, lists) as
+    they are."""
 
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=28)
@@ -84,7 +87,8 @@ class _Help(argparse.HelpFormatter):
 
 
 class Parser(argparse.ArgumentParser):
-    """Its errors say what may have been meant; its help ends with the options that all commands have.
+    """Its errors say what may have been meant; its help ends with the options that all commands
+    have.
 
     Attributes:
         listing: what stands in the help in place of argparse's list of commands.
@@ -102,7 +106,9 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Say it with the nearest command, option or value, and exit with status 2."""
         flags = [flag for action in self._actions for flag in action.option_strings]
-        if found := re.match(r"argument (\S+): invalid choice: '(.*?)' \(choose from (.*)\)", message):
+        if found := re.match(
+            r"argument (\S+): invalid choice: '(.*?)' \(choose from (.*)\)", message
+        ):
             name, given, rest = found.groups()
             choices = re.findall(r"[\w-]+", rest)
             if name == "COMMAND":
@@ -139,7 +145,10 @@ def _text(text: str) -> str:
 
 _TYPES: dict[Any, Callable[[str], Any]] = {Path: _path, str: _text}
 """What nobody means by an empty text: a path would be the current folder."""
-_HINTS = {"scan": " (torchpcct simulate makes scans)", "config": " (torchpcct show-config prints an example)"}
+_HINTS = {
+    "scan": " (torchpcct simulate makes scans)",
+    "config": " (torchpcct show-config prints an example)",
+}
 
 
 def is_path(action: argparse.Action) -> bool:
@@ -154,21 +163,27 @@ def examples(parser: argparse.ArgumentParser, *lines: str, before: str = "") -> 
 
 
 def add_options(parser: Parser, *rows: tuple[Any, ...], group: str = "") -> None:
-    """Declare options from a table, with the limits that :func:`check_limits` holds their values to.
+    """Declare options from a table, with the limits that :func:`check_limits` holds their values
+    to.
 
     Args:
         parser: of the command.
-        rows: flags (without dashes: an argument), type (``bool``: a switch), metavar or None, help, and, where there is
-            more to say, a mapping of ``limits`` (of :func:`torchpcct.validate.number`, for several values of each; of
-            whole numbers ``low`` and ``high``), ``read`` (True: files that must be there), and of what
-            ``add_argument`` takes.
+        rows: flags (without dashes: an argument), type (``bool``: a switch), metavar or None, help,
+            and, where there is more to say, a mapping of ``limits`` (of
+            :func:`torchpcct.validate.number`, for several values of each; of whole numbers ``low``
+            and ``high``), ``read`` (True: files that must be there), and of what ``add_argument``
+            takes.
         group: title of the group in the help; "": with the others.
     """
     to = parser.add_argument_group(group) if group else parser
     for flag, kind, metavar, text, *more in rows:
         keys: dict[str, Any] = dict(more[0]) if more else {}
         limits, read = keys.pop("limits", None), keys.pop("read", False)
-        keys |= {"action": "store_true"} if kind is bool else {"type": _TYPES.get(kind, kind), "metavar": metavar}
+        keys |= (
+            {"action": "store_true"}
+            if kind is bool
+            else {"type": _TYPES.get(kind, kind), "metavar": metavar}
+        )
         action = to.add_argument(*flag.split(), help=text, **keys)
         if limits is not None:
             parser.limits[action.dest] = limits
@@ -177,14 +192,21 @@ def add_options(parser: Parser, *rows: tuple[Any, ...], group: str = "") -> None
 
 
 def check_limits(arguments: argparse.Namespace, parser: Parser) -> None:
-    """Refuse, before a command does anything, values beyond the limits of their options, and files that are not there.
+    """Refuse, before a command does anything, values beyond the limits of their options, and files
+    that are not there.
 
     Raises:
         ValueError: a value out of range. FileNotFoundError: no such file.
     """
     for name, limits in parser.limits.items():
         value = getattr(arguments, name)
-        flag = next(o for a in parser._actions if a.dest == name for o in a.option_strings if o.startswith("--"))
+        flag = next(
+            o
+            for a in parser._actions
+            if a.dest == name
+            for o in a.option_strings
+            if o.startswith("--")
+        )
         if isinstance(value, int):
             whole(flag, value, **limits)
         elif isinstance(value, float):
@@ -214,7 +236,8 @@ def command(
 
     Args:
         lines: example commands; before: what stands before them.
-        out: help of ``--out``; "": the command has none of the common options. required: ``--out`` has no default.
+        out: help of ``--out``; "": the command has none of the common options. required: ``--out``
+            has no default.
         seed: default of ``--seed``; None: the configuration's.
     """
     parser: Parser = commands.add_parser(name, help=help, description=description)
@@ -227,8 +250,20 @@ def command(
     add_options(parser, ("--out", Path, "PATH", out, {"required": required}))
     add_options(
         parser,
-        ("--seed", int, None, f"first seed of the noise, ≥ 0 (default {default})", {"default": seed, "limits": _SEED}),
-        ("--device", str, None, "where volumes are kept (default cpu)", {"choices": ("cpu", "cuda"), "default": "cpu"}),
+        (
+            "--seed",
+            int,
+            None,
+            f"first seed of the noise, ≥ 0 (default {default})",
+            {"default": seed, "limits": _SEED},
+        ),
+        (
+            "--device",
+            str,
+            None,
+            "where volumes are kept (default cpu)",
+            {"choices": ("cpu", "cuda"), "default": "cpu"},
+        ),
         FORCE,
         ("--no-progress", bool, None, "no progress bars"),
         ("-v --verbose", bool, None, "log what the library does"),
@@ -247,18 +282,21 @@ def _in_brackets(deep: int) -> str:
 
 
 _VALUES = re.compile(
-    rf"[A-Za-z_][\w.]*\({_in_brackets(4)}\)"  # VolumeGrid(shape=(8, 8), center=(0.0, 0.0)): what an object prints
+    # VolumeGrid(shape=(8, 8), center=(0.0, 0.0)): what an object prints
+    rf"[A-Za-z_][\w.]*\({_in_brackets(4)}\)"
     r"""|(?<![\w=])'[^']*'(?!\w)|(?<![\w=])"[^"]*"(?!\w)"""  # what the user gave
 )
 
 
 def as_options(text: str, actions: Sequence[argparse.Action]) -> str:
-    """A message of the library with the command's options in place of its arguments: ``--pitch MM`` for ``pitch=``.
+    """A message of the library with the command's options in place of its arguments: ``--pitch MM``
+    for ``pitch=``.
 
     Values that the message shows stay as they are: quoted ones, printed objects, paths.
 
     Args:
-        text: arguments stand in it as ``name=`` or ``name=value``, or before "must" or "needs" at its start.
+        text: arguments stand in it as ``name=`` or ``name=value``, or before "must" or "needs" at
+            its start.
         actions: of the command's parser.
     """
     shown = _VALUES.findall(text)
@@ -299,7 +337,8 @@ class _ShownOnce(logging.Handler):
 
 @contextmanager
 def saying(actions: Sequence[argparse.Action], verbose: bool) -> Iterator[Callable[[str], None]]:
-    """While a command runs: what the library logs, what it warns of, and what the command adds, each shown once.
+    """While a command runs: what the library logs, what it warns of, and what the command adds,
+    each shown once.
 
     Args:
         actions: of the command's parser, for :func:`as_options`.
@@ -319,10 +358,14 @@ def saying(actions: Sequence[argparse.Action], verbose: bool) -> Iterator[Callab
 
 
 def as_json(value: Any, inset: str = "") -> str:
-    """JSON with a line for every key; lists of numbers and texts, and of such lists, on one line."""
+    """JSON with a line for every key; lists of numbers and texts, and of such lists, on one
+    line."""
     deeper = inset + " "
     if isinstance(value, Mapping) and value:
-        lines = [f"{json.dumps(str(k), ensure_ascii=False)}: {as_json(v, deeper)}" for k, v in value.items()]
+        lines = [
+            f"{json.dumps(str(k), ensure_ascii=False)}: {as_json(v, deeper)}"
+            for k, v in value.items()
+        ]
         brackets = "{}"
     elif isinstance(value, list | tuple) and any(isinstance(v, Mapping) for v in value):
         lines, brackets = [as_json(v, deeper) for v in value], "[]"
@@ -332,7 +375,8 @@ def as_json(value: Any, inset: str = "") -> str:
 
 
 def tell(arguments: argparse.Namespace, short: str, config: dict[str, Any], **summary: Any) -> None:
-    """Write summary (JSON) and resolved configuration (YAML) beside the result, and print one line or, asked, all."""
+    """Write summary (JSON) and resolved configuration (YAML) beside the result, and print one
+    line or, asked, all."""
     import yaml
 
     file: Path = arguments.out
@@ -348,34 +392,66 @@ def tell(arguments: argparse.Namespace, short: str, config: dict[str, Any], **su
 
 
 def _address(text: str) -> str:
-    if not (re.fullmatch(r"(\w+://)?[^\s/:]+:\d+/?", text) or "://" in text or Path(_text(text)).is_file()):
-        raise argparse.ArgumentTypeError(f"{text!r} is neither an address, tcp://HOST:PORT, nor a scheduler's file")
+    if not (
+        re.fullmatch(r"(\w+://)?[^\s/:]+:\d+/?", text)
+        or "://" in text
+        or Path(_text(text)).is_file()
+    ):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is neither an address, tcp://HOST:PORT, nor a scheduler's file"
+        )
     return text
 
 
 def add_execution(parser: Parser, dry_run: bool = True) -> None:
-    """Where jobs are run, for :func:`executing`; ``dry_run``: False of a command that has this option already."""
+    """Where jobs are run, for :func:`executing`; ``dry_run``: False of a command that has this
+    option already."""
     scheduler = os.environ.get("DASK_SCHEDULER_ADDRESS")
     add_options(
         parser,
-        ("--workers", int, "N", "processes of this machine (default: this one alone)", {"limits": {"high": MOST}}),
-        ("--scheduler", _address, "ADDRESS", "Dask scheduler, tcp://HOST:PORT or its file (default: "
-         "$DASK_SCHEDULER_ADDRESS); extra: cluster", {"default": scheduler}),
-        ("--threads", int, "K", "threads of each worker (default: cores / N; Dask: 1)", {"limits": {"high": MOST}}),
-        *([("--dry-run", bool, None, "list the jobs, their time and memory; run none")] if dry_run else []),
+        (
+            "--workers",
+            int,
+            "N",
+            "processes of this machine (default: this one alone)",
+            {"limits": {"high": MOST}},
+        ),
+        (
+            "--scheduler",
+            _address,
+            "ADDRESS",
+            "Dask scheduler, tcp://HOST:PORT or its file (default: "
+            "$DASK_SCHEDULER_ADDRESS); extra: cluster",
+            {"default": scheduler},
+        ),
+        (
+            "--threads",
+            int,
+            "K",
+            "threads of each worker (default: cores / N; Dask: 1)",
+            {"limits": {"high": MOST}},
+        ),
+        *(
+            [("--dry-run", bool, None, "list the jobs, their time and memory; run none")]
+            if dry_run
+            else []
+        ),
         group="several processes or machines",
-    )  # fmt: skip
+    )
 
 
 @contextmanager
 def executing(arguments: argparse.Namespace, out: Path) -> Iterator[Any]:
-    """Run the jobs of a block where the options say, noted in ``OUT/jobs-DATE.log``; ``--dry-run`` lists them.
+    """Run the jobs of a block where the options say, noted in ``OUT/jobs-DATE.log``; ``--dry-run``
+    lists them.
 
     Yields:
         The executor; None: everything is done here, one after another.
     """
     if arguments.threads is not None and arguments.workers is None and not arguments.scheduler:
-        raise ValueError("--threads K is of the workers: give --workers N or --scheduler ADDRESS with it")
+        raise ValueError(
+            "--threads K is of the workers: give --workers N or --scheduler ADDRESS with it"
+        )
     from recon.evaluate import execute
 
     executor: Any = None
@@ -396,7 +472,8 @@ def executing(arguments: argparse.Namespace, out: Path) -> Iterator[Any]:
 
 
 class Ended(KeyboardInterrupt):
-    """A signal of the system has told the command to end, as Ctrl-C does; ``number`` is the signal's."""
+    """A signal of the system has told the command to end, as Ctrl-C does; ``number`` is the
+    signal's."""
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -405,10 +482,11 @@ class Ended(KeyboardInterrupt):
 
 @contextmanager
 def ending_by_signals() -> Iterator[None]:
-    """SIGTERM (a batch system's time is up) and SIGHUP (the terminal is closed) raise :class:`Ended` in a block.
+    """SIGTERM (a batch system's time is up) and SIGHUP (the terminal is closed) raise
+    :class:`Ended` in a block.
 
-    Processes are then ended and files taken back that are half written. What is ignored (``nohup``) stays so, and what
-    comes on the way out is.
+    Processes are then ended and files taken back that are half written. What is ignored (``nohup``)
+    stays so, and what comes on the way out is.
     """
     numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     main = threading.current_thread() is threading.main_thread()
@@ -429,9 +507,13 @@ def ending_by_signals() -> Iterator[None]:
 
 
 def check_output(
-    arguments: argparse.Namespace, is_own: Callable[[Path], bool], *inputs: str | Path | None, beside: bool = False
+    arguments: argparse.Namespace,
+    is_own: Callable[[Path], bool],
+    *inputs: str | Path | None,
+    beside: bool = False,
 ) -> None:
-    """See, before anything is computed, that ``--out`` can be written and that nothing of the user's is lost by it.
+    """See, before anything is computed, that ``--out`` can be written and that nothing of the
+    user's is lost by it.
 
     Args:
         is_own: whether an existing file is one that this command would have made.
@@ -439,7 +521,8 @@ def check_output(
         beside: whether :func:`tell` writes beside it.
 
     Raises:
-        ValueError: an input, also by another name, or without ``--force`` something else is there already; a folder.
+        ValueError: an input, also by another name, or without ``--force`` something else is there
+            already; a folder.
         OSError: there is no such folder, or nothing can be written into it.
     """
     out: Path = arguments.out
@@ -450,29 +533,38 @@ def check_output(
         if not path.exists():
             continue
         if any(one is not None and Path(one).exists() and path.samefile(one) for one in inputs):
-            raise ValueError(f"--out {out} would write onto {path}, which is read: name another file")
+            raise ValueError(
+                f"--out {out} would write onto {path}, which is read: name another file"
+            )
         own = is_own(path) if path is out else "file" in _json(summary)
         if path.is_dir() and not own:
             raise ValueError(f"{path} is a folder: name a file to write")
         if not (own or arguments.force):
             raise ValueError(
-                f"{path} exists and was not made by torchpcct {arguments.command}: name another file, or --force"
+                f"{path} exists and was not made by torchpcct {arguments.command}: name another "
+                "file, or --force"
             )
 
 
 def check_results(
-    arguments: argparse.Namespace, folder: Path, is_own: Callable[[dict[str, Any]], bool], *patterns: str
+    arguments: argparse.Namespace,
+    folder: Path,
+    is_own: Callable[[dict[str, Any]], bool],
+    *patterns: str,
 ) -> None:
-    """The same for a folder of results: files of these names are replaced if its ``report.json`` is of this command.
+    """The same for a folder of results: files of these names are replaced if its ``report.json`` is
+    of this command.
 
     Raises:
-        ValueError: without ``--force``, files of another origin. OSError: nothing can be written there.
+        ValueError: without ``--force``, files of another origin. OSError: nothing can be written
+            there.
     """
     require_writable(next(p for p in (folder, *folder.absolute().parents) if p.exists()))
     there = sorted({path.name for pattern in patterns for path in folder.glob(pattern)})
     if there and not is_own(_json(folder / "report.json")) and not arguments.force:
         raise ValueError(
-            f"{folder} holds {', '.join(there[:3])}{' …' if there[3:] else ''}, not made by torchpcct "
+            f"{folder} holds {', '.join(there[:3])}{' …' if there[3:] else ''}, not made by "
+            "torchpcct "
             f"{arguments.command}: name another folder, or --force"
         )
 
@@ -481,7 +573,9 @@ def is_picture(path: Path) -> bool:
     """Whether a file begins as its ending says: PNG, PDF or SVG."""
     with path.open("rb") as file:
         head = file.read(512)
-    return {".png": head.startswith(b"\x89PNG"), ".pdf": head.startswith(b"%PDF")}.get(path.suffix, b"<svg" in head)
+    return {".png": head.startswith(b"\x89PNG"), ".pdf": head.startswith(b"%PDF")}.get(
+        path.suffix, b"<svg" in head
+    )
 
 
 def _json(path: Path) -> dict[str, Any]:
@@ -520,4 +614,10 @@ def map_beside(volume: Path) -> Path:
 def without_ending(path: Path) -> str:
     """The name of a scan, a volume or a folder without what says its format."""
     name = path.resolve().name
-    return name[: -len(".nii.gz")] if name.endswith(".nii.gz") else name if path.is_dir() else Path(name).stem
+    return (
+        name[: -len(".nii.gz")]
+        if name.endswith(".nii.gz")
+        else name
+        if path.is_dir()
+        else Path(name).stem
+    )

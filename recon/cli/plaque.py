@@ -35,14 +35,19 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     from recon.plaque.vessel_prior import VesselPrior
     from torchpcct.scan import Scan
 
-    believed = VesselPrior(tuple(arguments.wall or VesselPrior.wall), tuple(arguments.fibrous or VesselPrior.fibrous))
+    believed = VesselPrior(
+        tuple(arguments.wall or VesselPrior.wall), tuple(arguments.fibrous or VesselPrior.fibrous)
+    )
     scan = Scan.load(arguments.scan)
     if scan.window is None and (arguments.center is None or arguments.extent is None):
         raise ValueError(
-            f"{arguments.scan} holds the whole detector, and a vessel is read in a small inset: --center Z Y X and "
+            f"{arguments.scan} holds the whole detector, and a vessel is read in a small inset: "
+            "--center Z Y X and "
             "--extent Z Y X say which"
         )
-    grid = VolumeGrid.of(scan, voxel=arguments.voxel, extent=arguments.extent, center=arguments.center)
+    grid = VolumeGrid.of(
+        scan, voxel=arguments.voxel, extent=arguments.extent, center=arguments.center
+    )
     if arguments.point is not None:
         require_within(arguments.point, grid)
     start = time.perf_counter()
@@ -50,9 +55,13 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     data = TissueData.of_scan(scan, problem)
     made = time.perf_counter()
     reading = read_plaque(
-        data, arguments.point, point_sd=arguments.point_sd, particles=arguments.particles, vessel_prior=believed,
+        data,
+        arguments.point,
+        point_sd=arguments.point_sd,
+        particles=arguments.particles,
+        vessel_prior=believed,
         seed=arguments.seed,
-    )  # fmt: skip
+    )
     seconds = {"operator": round(made - start, 2), "reading": round(time.perf_counter() - made, 2)}
     others = {"soft FBP": reconstruct(scan, grid, "fbp", kernel="soft").data}
     for method in arguments.beside:
@@ -69,21 +78,36 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 def add_plaque(commands: Commands) -> None:
     """Add the command."""
     parser = command(
-        commands, "plaque", _plaque, "read a vessel's tissues: values, outlines and plaque bodies with intervals",
-        "Fit a contrast-enhanced vessel's tissues to a scan: outlines of lumen and outer wall, tissue values, plaque "
-        "bodies with the probability that they are there; beside each figure what FBP reads over the same regions.",
+        commands,
+        "plaque",
+        _plaque,
+        "read a vessel's tissues: values, outlines and plaque bodies with intervals",
+        "Fit a contrast-enhanced vessel's tissues to a scan: outlines of lumen and outer wall, "
+        "tissue values, plaque "
+        "bodies with the probability that they are there; beside each figure what FBP reads over "
+        "the same regions.",
         "torchpcct plaque plaque.h5 --beside mbir --out reading",
-        out="folder for report.md, report.json, tissues.nii.gz, image.nii.gz and plaque.png (default out/plaque)",
-    )  # fmt: skip
+        out="folder for report.md, report.json, tissues.nii.gz, image.nii.gz and plaque.png "
+        "(default out/plaque)",
+    )
     length, place = LENGTH, {"nargs": 3, "limits": PLACE}
     value = {"nargs": 2, "limits": {"low": -1e5, "high": 1e5, "unit": "HU"}}
-    believed = "value that is expected of this tissue, and its standard deviation (default: see the report)"
+    believed = (
+        "value that is expected of this tissue, and its standard deviation (default: see "
+        "the report)"
+    )
     axes = ("Z", "Y", "X")
     add_options(
         parser,
         ("scan", Path, "SCAN", "scan file written by simulate", {"read": True}),
         ("--point", float, axes, "where a reader sees the plaque, mm", place),
-        ("--point-sd", float, "MM", "its standard deviation (default 0.4)", {"default": 0.4, "limits": length}),
+        (
+            "--point-sd",
+            float,
+            "MM",
+            "its standard deviation (default 0.4)",
+            {"default": 0.4, "limits": length},
+        ),
         (
             "--particles",
             int,
@@ -93,8 +117,20 @@ def add_plaque(commands: Commands) -> None:
         ),
         ("--wall", float, ("HU", "SD"), believed, value),
         ("--fibrous", float, ("HU", "SD"), believed, value),
-        ("--beside", str, None, "read these images, too", {"nargs": "*", "default": [], "choices": ("pwls", "mbir")}),
+        (
+            "--beside",
+            str,
+            None,
+            "read these images, too",
+            {"nargs": "*", "default": [], "choices": ("pwls", "mbir")},
+        ),
         ("--voxel", float, "MM", "voxel size (default 0.2)", {"default": 0.2, "limits": length}),
         ("--center", float, axes, "centre in mm (default: of the region that was scanned)", place),
-        ("--extent", float, axes, "edge lengths in mm (default: the region)", {"nargs": 3, "limits": length}),
+        (
+            "--extent",
+            float,
+            axes,
+            "edge lengths in mm (default: the region)",
+            {"nargs": 3, "limits": length},
+        ),
     )

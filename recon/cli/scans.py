@@ -66,7 +66,7 @@ _FBP_RATE = 1e8
 """Voxel updates of the backprojection a second on one core, for a rough estimate."""
 
 
-# --- simulate -----------------------------------------------------------------------------------------------------
+# --- simulate -------------------------------------------------------------------------------------
 
 
 def _paper(arguments: argparse.Namespace) -> SimulationConfig:
@@ -79,9 +79,15 @@ def _paper(arguments: argparse.Namespace) -> SimulationConfig:
     scene, plaque = plaque_scene()
     views = _PAPER_VIEWS if arguments.views is None else arguments.views
     region = None if arguments.whole else inset_grid(plaque, 0.25)
-    kept = None if region is None else {
-        "shape": list(region.shape), "spacing": list(region.spacing), "center": list(region.center)
-    }  # fmt: skip
+    kept = (
+        None
+        if region is None
+        else {
+            "shape": list(region.shape),
+            "spacing": list(region.spacing),
+            "center": list(region.center),
+        }
+    )
     values = {
         "scene": {"kind": "plaque"},
         "scanner": {"preset": "pcct", "views": views},
@@ -90,14 +96,18 @@ def _paper(arguments: argparse.Namespace) -> SimulationConfig:
         "region": kept,
         "tolerance_hu": 0.5,
     }
-    return SimulationConfig(scene, presets.pcct(views=views), region, arguments.exposure, values["seed"], 0.5, values)
+    return SimulationConfig(
+        scene, presets.pcct(views=views), region, arguments.exposure, values["seed"], 0.5, values
+    )
 
 
 def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     check_ending(arguments.out, SCAN_ENDINGS)
     check_output(arguments, _is_scan, arguments.config, beside=True)
     if arguments.config is not None and (arguments.views is not None or arguments.whole):
-        raise ValueError("--views and --whole are the plaque scan's: put views and region into the configuration")
+        raise ValueError(
+            "--views and --whole are the plaque scan's: put views and region into the configuration"
+        )
     from torchpcct.acquisition.acquire import acquire, plan
     from torchpcct.acquisition.config import read_config
     from torchpcct.scene.voxels import VoxelScene
@@ -112,22 +122,48 @@ def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         import yaml
 
         print(yaml.safe_dump(config.values, sort_keys=False, allow_unicode=True))
-        print(_voxel_plan(config, config.scene) if isinstance(config.scene, VoxelScene) else plan(
-            config.scene, config.scanner, region=config.region, tolerance_hu=config.tolerance_hu,
-            rotation_s=config.exposure_s,
-        ).table())  # fmt: skip
+        print(
+            _voxel_plan(config, config.scene)
+            if isinstance(config.scene, VoxelScene)
+            else plan(
+                config.scene,
+                config.scanner,
+                region=config.region,
+                tolerance_hu=config.tolerance_hu,
+                rotation_s=config.exposure_s,
+            ).table()
+        )
         return
-    options: dict[str, Any] = {} if voxels else {"region": config.region, "tolerance_hu": config.tolerance_hu}
-    scan = acquire(config.scene, config.scanner, exposure_s=config.exposure_s, seed=config.seed,
-                   progress=progress.of("simulate"), **options)  # fmt: skip
+    options: dict[str, Any] = (
+        {} if voxels else {"region": config.region, "tolerance_hu": config.tolerance_hu}
+    )
+    scan = acquire(
+        config.scene,
+        config.scanner,
+        exposure_s=config.exposure_s,
+        seed=config.seed,
+        progress=progress.of("simulate"),
+        **options,
+    )
     progress.close()
     scan.save(arguments.out)
     mean = float(scan.counts.mean())
-    short = f"{' × '.join(map(str, scan.counts.shape))} readings, mean {mean:.4g}, {scan.info['seconds']} s"
+    short = (
+        f"{' × '.join(map(str, scan.counts.shape))} readings, mean {mean:.4g}, "
+        f"{scan.info['seconds']} s"
+    )
     if voxels:
         short += f"; {_dense(scan.info['plan']['above_muscle'])}"
-    tell(arguments, short, config.values, readings=list(scan.counts.shape), exposure_s=scan.exposure_s, seed=scan.seed,
-         mean_count=mean, **scan.info)  # fmt: skip
+    tell(
+        arguments,
+        short,
+        config.values,
+        readings=list(scan.counts.shape),
+        exposure_s=scan.exposure_s,
+        seed=scan.seed,
+        mean_count=mean,
+        **scan.info,
+    )
 
 
 def _is_scan(path: Path) -> bool:
@@ -138,7 +174,8 @@ def _voxel_plan(config: SimulationConfig, scene: VoxelScene) -> str:
     g = config.scanner.geometry
     readings = math.prod(g.shape)
     return (
-        f"{readings / 1e6:.2f} M readings of a voxel volume, about {readings * 4 * 2 / 2**30:.2f} GiB\n"
+        f"{readings / 1e6:.2f} M readings of a voxel volume, about {readings * 4 * 2 / 2**30:.2f} "
+        "GiB\n"
         f"{_dense(scene.above_muscle)}"
     )
 
@@ -157,13 +194,19 @@ _OUTPUT = (
 
 def add_simulate(commands: Commands) -> None:
     parser = command(
-        commands, "simulate", _simulate, "simulate a scan to an HDF5 file",
-        "Simulate a scan of any scene (--config, see show-config) or, without one, of the paper's plaque by the "
+        commands,
+        "simulate",
+        _simulate,
+        "simulate a scan to an HDF5 file",
+        "Simulate a scan of any scene (--config, see show-config) or, without one, of the paper's "
+        "plaque by the "
         "deep-silicon PCCT, and write it to HDF5, with what was done beside (.json, .yaml).",
         "torchpcct simulate --exposure 2 --out plaque.h5",
         "torchpcct show-config > scene.yaml; torchpcct simulate --config scene.yaml --out scan.h5",
-        out="HDF5 file to write", required=True, seed=None,
-    )  # fmt: skip
+        out="HDF5 file to write",
+        required=True,
+        seed=None,
+    )
     add_options(
         parser,
         ("--config", Path, "YAML", "scene, scanner and exposure", {"read": True}),
@@ -189,14 +232,19 @@ def _show_config(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 
 def add_show_config(commands: Commands) -> None:
     parser = command(
-        commands, "show-config", _show_config, "print a full example for simulate --config, or of a .yaml stack",
-        "Print a full YAML example: for simulate --config, or, with --stack, of a stack of projections.",
-        "torchpcct show-config > scene.yaml", "torchpcct show-config --stack > projections.yaml",
-    )  # fmt: skip
+        commands,
+        "show-config",
+        _show_config,
+        "print a full example for simulate --config, or of a .yaml stack",
+        "Print a full YAML example: for simulate --config, or, with --stack, of a stack of "
+        "projections.",
+        "torchpcct show-config > scene.yaml",
+        "torchpcct show-config --stack > projections.yaml",
+    )
     add_options(parser, ("--stack", bool, None, "the file beside TIFF or NumPy projections"))
 
 
-# --- reconstruct --------------------------------------------------------------------------------------------------
+# --- reconstruct ----------------------------------------------------------------------------------
 
 
 def _size(text: str) -> str:
@@ -212,41 +260,90 @@ def _slices(text: str) -> slice:
     """``A:B`` of a command line, either end left out."""
     found = re.fullmatch(r"\s*(\d*):(\d*)\s*", text)
     if not found or found[1] == found[2] == "":
-        raise argparse.ArgumentTypeError(f"{text!r} is not A:B, the first slice and the one after the last, from 0")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not A:B, the first slice and the one after the last, from 0"
+        )
     first, stop = (int(end) if end else None for end in found.groups())
     if first is not None and stop is not None and first >= stop:
-        raise argparse.ArgumentTypeError(f"{text!r} holds no slice: the second number must be the larger one")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} holds no slice: the second number must be the larger one"
+        )
     return slice(first, stop)
 
 
 def _add_reader_options(parser: Parser, many: bool = False) -> None:
     """The scan, or many of them, and what its file may not know, see :func:`_reader_options`."""
     nargs = {"nargs": "+"} if many else {"read": True}
-    formats = ".h5 (ours, Data Exchange, NeXus), .yaml stack, .xtekct, .txrm, .mat, CatSim, DICOM-CT-PD folder"
+    formats = (
+        ".h5 (ours, Data Exchange, NeXus), .yaml stack, .xtekct, .txrm, .mat, CatSim, "
+        "DICOM-CT-PD folder"
+    )
     add_options(parser, ("scan", Path, "SCAN", formats, nargs))
     add_options(
         parser,
-        ("--geometry", Path, "YAML", "geometry of files that do not hold it; one with kind: vectors, kind: rtk or "
-         "pose: takes the place of the file's own", {"read": True}),
-        ("--mu-water", float, "MM⁻¹", "attenuation of water; with it the volume is in HU",
-         {"limits": {**LENGTH, "unit": "mm⁻¹"}}),
-        ("--axis", float, "COLUMN", "where the rotation axis projects to, counted from 0",
-         {"limits": {"low": 0.0, "high": 1e6}}),
-        ("--pitch", float, "MM", "cell width of parallel beams, where the file does not hold it", {"limits": LENGTH}),
-        ("--photons", float, "N", "photons of an unattenuated reading, of scans given as line integrals",
-         {"limits": {"positive": True, "high": 1e18}}),
+        (
+            "--geometry",
+            Path,
+            "YAML",
+            "geometry of files that do not hold it; one with kind: vectors, kind: rtk or "
+            "pose: takes the place of the file's own",
+            {"read": True},
+        ),
+        (
+            "--mu-water",
+            float,
+            "MM⁻¹",
+            "attenuation of water; with it the volume is in HU",
+            {"limits": {**LENGTH, "unit": "mm⁻¹"}},
+        ),
+        (
+            "--axis",
+            float,
+            "COLUMN",
+            "where the rotation axis projects to, counted from 0",
+            {"limits": {"low": 0.0, "high": 1e6}},
+        ),
+        (
+            "--pitch",
+            float,
+            "MM",
+            "cell width of parallel beams, where the file does not hold it",
+            {"limits": LENGTH},
+        ),
+        (
+            "--photons",
+            float,
+            "N",
+            "photons of an unattenuated reading, of scans given as line integrals",
+            {"limits": {"positive": True, "high": 1e18}},
+        ),
         ("--slices", _slices, "A:B", "read only these slices (parallel, fan) or rows (cone beam)"),
-        ("--angles-deg", _angles, "FILE|START:STEP", "angles of Data Exchange and NeXus in degrees: a text file with "
-         "one a line, or the first and their step"),
-        ("--air", _number_or_file, "N|FILE", "reading without the object, of files that hold none: a number, or .tif, "
-         ".npy, a pattern"),
+        (
+            "--angles-deg",
+            _angles,
+            "FILE|START:STEP",
+            "angles of Data Exchange and NeXus in degrees: a text file with "
+            "one a line, or the first and their step",
+        ),
+        (
+            "--air",
+            _number_or_file,
+            "N|FILE",
+            "reading without the object, of files that hold none: a number, or .tif, "
+            ".npy, a pattern",
+        ),
         ("--dark", _number_or_file, "N|FILE", "reading without beam, as --air"),
         ("--entry", str, "NAME", "of a NeXus file with several scans"),
         ("--variable", str, "NAME", "of a MATLAB file with several arrays"),
-        ("--spot", int, "K", "of a flying focal spot: only the views from its position K",
-         {"limits": {"low": 0, "high": 63}}),
+        (
+            "--spot",
+            int,
+            "K",
+            "of a flying focal spot: only the views from its position K",
+            {"limits": {"low": 0, "high": 63}},
+        ),
         group="what the file does not know of its scan",
-    )  # fmt: skip
+    )
 
 
 def _number_or_file(text: str) -> float | str:
@@ -256,7 +353,9 @@ def _number_or_file(text: str) -> float | str:
     except ValueError:
         return _there(text)
     if not math.isfinite(value) or value < 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is no reading: a finite number of 0 or more, or a file")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no reading: a finite number of 0 or more, or a file"
+        )
     return value
 
 
@@ -281,7 +380,18 @@ def _angles(text: str) -> dict[str, float] | str:
     return {"start": start, "step": step}
 
 
-_READ_WITH = ("axis", "pitch", "mu_water", "photons", "angles_deg", "air", "dark", "entry", "variable", "spot")
+_READ_WITH = (
+    "axis",
+    "pitch",
+    "mu_water",
+    "photons",
+    "angles_deg",
+    "air",
+    "dark",
+    "entry",
+    "variable",
+    "spot",
+)
 
 
 def _reader_options(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -301,27 +411,35 @@ def _reader_options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def grid_of_scan(scan: Any, arguments: argparse.Namespace) -> VolumeGrid:
     """The grid that was asked for, see :meth:`torchpcct.VolumeGrid.of`."""
-    return VolumeGrid.of(scan, voxel=arguments.voxel, extent=arguments.extent, center=arguments.center)
+    return VolumeGrid.of(
+        scan, voxel=arguments.voxel, extent=arguments.extent, center=arguments.center
+    )
 
 
 def _length(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no length in mm (a file stands before this option)") from None
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no length in mm (a file stands before this option)"
+        ) from None
 
 
 def _require_voxels(shape: tuple[int, ...]) -> None:
     if math.prod(shape) > MOST_VOXELS:
         raise ValueError(
-            f"--voxel makes {' × '.join(map(str, shape))} voxels, more than {MOST_VOXELS:.0e}: enlarge the voxels, or "
+            f"--voxel makes {' × '.join(map(str, shape))} voxels, more than {MOST_VOXELS:.0e}: "
+            "enlarge the voxels, or "
             "reconstruct a smaller --extent"
         )
 
 
 _MAP = "drawn_minus_plain_hu"
 """What a drawn vessel has changed, in a report of MBIR."""
-_OPTIONS = {"kernel": "fbp", **dict.fromkeys(("fidelity", "vessel", "tissues", "point", "weights", "network"), "mbir")}
+_OPTIONS = {
+    "kernel": "fbp",
+    **dict.fromkeys(("fidelity", "vessel", "tissues", "point", "weights", "network"), "mbir"),
+}
 """Options that one method has."""
 
 
@@ -334,17 +452,27 @@ def _method_options(arguments: argparse.Namespace) -> dict[str, Any]:
     method, named = split_method(arguments.method)
     if arguments.kernel is not None:
         choice("kernel", arguments.kernel, KERNELS)
-    given = {k: v for k, v in vars(arguments).items() if k in _OPTIONS and v is not None and v is not False}
+    given = {
+        k: v
+        for k, v in vars(arguments).items()
+        if k in _OPTIONS and v is not None and v is not False
+    }
     for name in given:
         if method != _OPTIONS[name]:
             option = name.replace("_", "-")
-            raise ValueError(f"--{option} is an option of --method {_OPTIONS[name]}, not of {method}")
+            raise ValueError(
+                f"--{option} is an option of --method {_OPTIONS[name]}, not of {method}"
+            )
         if name in named:
-            raise ValueError(f"--{name} stands in --method {arguments.method}, too: leave out one of them")
+            raise ValueError(
+                f"--{name} stands in --method {arguments.method}, too: leave out one of them"
+            )
     given = named | given
     if "network" in given:
         if "weights" not in given:
-            raise ValueError("--network is the class of weights of yours: give it with --weights FILE")
+            raise ValueError(
+                "--network is the class of weights of yours: give it with --weights FILE"
+            )
         if not is_module_name(given["network"]):
             raise ValueError(f"--network must be package.module:Class, got {given['network']!r}")
     if any(is_module_name(given.get(name, "")) for name in ("network", "prior")):
@@ -381,7 +509,9 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     outs = [f"{without_ending(scan)}_{_method(arguments)}{ending}" for scan in arguments.scan]
     twice = {name for name in outs if outs.count(name) > 1}
     if twice:
-        raise ValueError(f"several scans would become {', '.join(sorted(twice))}: give the files other names")
+        raise ValueError(
+            f"several scans would become {', '.join(sorted(twice))}: give the files other names"
+        )
     jobs = [_job(arguments, scan, out) for scan, out in zip(arguments.scan, outs, strict=True)]
     refused = []
 
@@ -400,7 +530,9 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         if _note(folder / f"{out}{_DONE}"):
             (folder / f"{out}{_DONE}").unlink(missing_ok=True)
     if refused:
-        raise ValueError(f"{len(refused)} of {len(jobs)} scans are not reconstructed: {'; '.join(refused)}")
+        raise ValueError(
+            f"{len(refused)} of {len(jobs)} scans are not reconstructed: {'; '.join(refused)}"
+        )
 
 
 def _reconstruct_elsewhere(arguments: argparse.Namespace, progress: ProgressBars) -> None:
@@ -426,23 +558,33 @@ def _job(arguments: argparse.Namespace, scan: Path, out: str) -> Any:
 
     common = {k: v for k, v in vars(arguments).items() if k not in ("run", "warn", "scan", "out")}
     mib = 4 * scan.stat().st_size / 2**20 if scan.is_file() else 0.0
-    return execute.Job(str(scan), reconstruct_one, ({**common, "scan": scan.resolve()}, out), (f"{out}*",), mib=mib)
+    return execute.Job(
+        str(scan), reconstruct_one, ({**common, "scan": scan.resolve()}, out), (f"{out}*",), mib=mib
+    )
 
 
 def reconstruct_one(folder: Path, options: dict[str, Any], out: str) -> tuple[list[str], str, str]:
     """A scan of many, anywhere: warnings, what is printed, and why it is refused.
 
-    A note lies beside a finished volume until all are: an interrupted command that is given again goes on, where scan,
-    options and volume are what they were.
+    A note lies beside a finished volume until all are: an interrupted command that is given again
+    goes on, where scan, options and volume are what they were.
     """
     from recon.study.study import ProgressBars
 
     noted, scan = folder / f"{out}{_DONE}", options["scan"]
-    asked = {k: str(v) for k, v in options.items() if k not in ("force", "no_progress", "workers", "threads",
-                                                                 "scheduler", "command_line")}  # fmt: skip
+    asked = {
+        k: str(v)
+        for k, v in options.items()
+        if k not in ("force", "no_progress", "workers", "threads", "scheduler", "command_line")
+    }
 
     def state() -> dict[str, Any]:
-        return {"torchpcct": VERSION, "asked": asked, "scan": fingerprint(scan), "volume": fingerprint(folder / out)}
+        return {
+            "torchpcct": VERSION,
+            "asked": asked,
+            "scan": fingerprint(scan),
+            "volume": fingerprint(folder / out),
+        }
 
     note = _note(noted)
     with contextlib.suppress(OSError):
@@ -460,12 +602,15 @@ def reconstruct_one(folder: Path, options: dict[str, Any], out: str) -> tuple[li
     text = printed.getvalue().rstrip()
     if not options["dry_run"] and (note or not noted.exists()):
         with atomic_write(noted) as part:
-            part.write_text(json.dumps({"state": state(), "messages": messages, "text": text}), encoding="utf-8")
+            part.write_text(
+                json.dumps({"state": state(), "messages": messages, "text": text}), encoding="utf-8"
+            )
     return messages, text, ""
 
 
 def _note(path: Path) -> dict[str, Any]:
-    """What :func:`reconstruct_one` noted beside a volume; empty: nothing, or the file is somebody else's."""
+    """What :func:`reconstruct_one` noted beside a volume; empty: nothing, or the file is
+    somebody else's."""
     try:
         note = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -477,15 +622,21 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
     options, method = _method_options(arguments), _method(arguments)
     slabs = arguments.memory is not None
     if arguments.out is None:
-        arguments.out = Path(f"{without_ending(arguments.scan)}_{method}.nii{'' if slabs else '.gz'}")
+        arguments.out = Path(
+            f"{without_ending(arguments.scan)}_{method}.nii{'' if slabs else '.gz'}"
+        )
     check_target(arguments.out)
     check_output(arguments, is_own_volume, arguments.scan, arguments.geometry, beside=True)
     for name in ("extent", "center"):
         given = getattr(arguments, name)
         if given is not None and len(given) not in (2, 3):
-            raise ValueError(f"--{name} must be three numbers, Z Y X, of slices two, Y X; got {len(given)}")
+            raise ValueError(
+                f"--{name} must be three numbers, Z Y X, of slices two, Y X; got {len(given)}"
+            )
     if arguments.voxel is not None and not slabs:
-        _require_voxels(tuple(math.ceil(e / arguments.voxel) for e in arguments.extent or (1.0, 1.0, 1.0)))
+        _require_voxels(
+            tuple(math.ceil(e / arguments.voxel) for e in arguments.extent or (1.0, 1.0, 1.0))
+        )
     if not arguments.scan.exists():
         raise FileNotFoundError(f"{arguments.scan} does not exist (torchpcct simulate makes scans)")
     import yaml
@@ -522,14 +673,17 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
         print(yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
         print(
             f"{arguments.out}: "
-            f"about {bytes_ / 2**30:.2f} GiB; FBP about {seconds:.1f} s on one core, iterative methods many times that"
+            f"about {bytes_ / 2**30:.2f} GiB; FBP about {seconds:.1f} s on one core, iterative "
+            "methods many times that"
         )
         return
     if "weights" in options:
         from recon.mbir.mbir import Mbir
 
         options["network"] = Mbir.load(options.pop("weights"), network=options.pop("network", None))
-    volume = reconstruct(scan, grid, method, progress=progress.of(method), device=arguments.device, **options)
+    volume = reconstruct(
+        scan, grid, method, progress=progress.of(method), device=arguments.device, **options
+    )
     progress.close()
     placed = {"axis": scan.info["axis"]} if arguments.find_axis else {}
     volume = replace(volume, report={**volume.report, **placed, **_made(arguments)}).slices()
@@ -543,24 +697,38 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
     _tell_volume(arguments, config, volume.grid, volume.unit, report)
 
 
-def _config(arguments: argparse.Namespace, scan: Any, grid: VolumeGrid, options: dict[str, Any]) -> dict[str, Any]:
+def _config(
+    arguments: argparse.Namespace, scan: Any, grid: VolumeGrid, options: dict[str, Any]
+) -> dict[str, Any]:
     from torchpcct.formats.geometry_yaml import geometry_values
 
     return {
-        "scan": str(arguments.scan), "geometry": geometry_values(scan.geometry), "method": _method(arguments),
-        "grid": {"shape": list(grid.shape), "spacing": list(grid.spacing), "center": list(grid.center)},
-        "unit": scan.unit, "clean": arguments.clean, **{k: v if k != "weights" else str(v) for k, v in options.items()},
-    }  # fmt: skip
+        "scan": str(arguments.scan),
+        "geometry": geometry_values(scan.geometry),
+        "method": _method(arguments),
+        "grid": {
+            "shape": list(grid.shape),
+            "spacing": list(grid.spacing),
+            "center": list(grid.center),
+        },
+        "unit": scan.unit,
+        "clean": arguments.clean,
+        **{k: v if k != "weights" else str(v) for k, v in options.items()},
+    }
 
 
 def _made(arguments: argparse.Namespace) -> dict[str, Any]:
     return {
-        "torchpcct": VERSION, "command": shlex.join(["torchpcct", *arguments.command_line]),
-        "input": str(arguments.scan), "input_sha256": fingerprint(arguments.scan),
-    }  # fmt: skip
+        "torchpcct": VERSION,
+        "command": shlex.join(["torchpcct", *arguments.command_line]),
+        "input": str(arguments.scan),
+        "input_sha256": fingerprint(arguments.scan),
+    }
 
 
-def _reconstruct_slabs(arguments: argparse.Namespace, options: dict[str, Any], progress: ProgressBars) -> None:
+def _reconstruct_slabs(
+    arguments: argparse.Namespace, options: dict[str, Any], progress: ProgressBars
+) -> None:
     """``--memory``: slab by slab (:mod:`recon.analytic.slabs`)."""
     import yaml
 
@@ -568,14 +736,20 @@ def _reconstruct_slabs(arguments: argparse.Namespace, options: dict[str, Any], p
     from torchpcct.formats.volume_slabs import check_slab_name
 
     check_slab_name(arguments.out)
-    for name, remedy in (("clean", "filters over all slices"), ("find_axis", "give --axis COLUMN, which "
-                         "--find-axis --slices A:B of a few slices finds,")):  # fmt: skip
+    for name, remedy in (
+        ("clean", "filters over all slices"),
+        ("find_axis", "give --axis COLUMN, which --find-axis --slices A:B of a few slices finds,"),
+    ):
         if getattr(arguments, name):
-            raise ValueError(f"--{name.replace('_', '-')} is not done slab by slab: {remedy} or leave out --memory")
+            raise ValueError(
+                f"--{name.replace('_', '-')} is not done slab by slab: {remedy} or leave out "
+                "--memory"
+            )
     reader = _reader_options(arguments)
     if reader.pop("slices", None) is not None:
         raise ValueError(
-            "--memory takes all slices of the scan: leave out --slices, or reconstruct those without --memory"
+            "--memory takes all slices of the scan: leave out --slices, or reconstruct those "
+            "without --memory"
         )
     source = ScanSlices(arguments.scan, **reader)
     grid = grid_of_scan(source, arguments)
@@ -584,21 +758,33 @@ def _reconstruct_slabs(arguments: argparse.Namespace, options: dict[str, Any], p
     method = _method(arguments)
     plan = plan_slabs(source.geometry, grid, arguments.memory, method)
     if arguments.dry_run:
-        print(as_json({**config, "estimate": {"file": str(arguments.out), **asdict(plan)}}) if arguments.json else
-              f"{yaml.safe_dump(config, sort_keys=False, allow_unicode=True)}\n{arguments.out}: {plan}")  # fmt: skip
+        if arguments.json:
+            print(as_json({**config, "estimate": {"file": str(arguments.out), **asdict(plan)}}))
+        else:
+            print(yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
+            print(f"{arguments.out}: {plan}")
         return
     if not arguments.json:
         print(plan)
     report = reconstruct_to(
-        source, grid, arguments.out, method, memory=arguments.memory,
-        progress=progress.of(method), **options,
-    )  # fmt: skip
+        source,
+        grid,
+        arguments.out,
+        method,
+        memory=arguments.memory,
+        progress=progress.of(method),
+        **options,
+    )
     progress.close()
     _tell_volume(arguments, config, grid, source.unit, {**report, **_made(arguments)})
 
 
 def _tell_volume(
-    arguments: argparse.Namespace, config: dict[str, Any], grid: VolumeGrid, unit: str, report: dict[str, Any]
+    arguments: argparse.Namespace,
+    config: dict[str, Any],
+    grid: VolumeGrid,
+    unit: str,
+    report: dict[str, Any],
 ) -> None:
     size = " × ".join(map(str, grid.shape))
     spacing = " × ".join(f"{s:.4g}" for s in grid.spacing)
@@ -615,15 +801,20 @@ def _tell_volume(
 
 def add_reconstruct(commands: Commands) -> None:
     parser = command(
-        commands, "reconstruct", _reconstruct, "reconstruct a scan file to a volume",
-        "Reconstruct a scan, ours or a foreign one, and write the volume, with what was done beside (.json, .yaml). "
+        commands,
+        "reconstruct",
+        _reconstruct,
+        "reconstruct a scan file to a volume",
+        "Reconstruct a scan, ours or a foreign one, and write the volume, with what was done "
+        "beside (.json, .yaml). "
         "Many scans go into a folder, each SCAN_METHOD.nii.gz.",
         "torchpcct reconstruct tooth.h5 --find-axis --out tooth.nii.gz",
         "torchpcct reconstruct scan.h5 --method mbir --fidelity 1 --out mbir.nii.gz",
         "torchpcct reconstruct scans/*.h5 --out volumes --workers 4",
-        out="folder of many scans; of one, volume to write: .nii, .nii.gz, .mha, .h5, .zarr, or no ending for DICOM "
+        out="folder of many scans; of one, volume to write: .nii, .nii.gz, .mha, .h5, .zarr, or "
+        "no ending for DICOM "
         "(default SCAN_METHOD.nii.gz)",
-    )  # fmt: skip
+    )
     own = "for separate slices only Y X"
     add_options(
         parser,
@@ -631,11 +822,17 @@ def add_reconstruct(commands: Commands) -> None:
             "--method",
             str,
             None,
-            "fbp, pwls or mbir (default fbp); with options as evaluate has them: mbir:prior=perona-malik, or "
+            "fbp, pwls or mbir (default fbp); with options as evaluate has them: "
+            "mbir:prior=perona-malik, or "
             "mbir:prior=package.module:function in the network's place",
             {"default": "fbp"},
         ),
-        ("--kernel", str, None, "of FBP, from quiet to sharp: soft, standard (default), detail, bone, ram-lak"),
+        (
+            "--kernel",
+            str,
+            None,
+            "of FBP, from quiet to sharp: soft, standard (default), detail, bone, ram-lak",
+        ),
         (
             "--fidelity --look",
             float,
@@ -647,11 +844,18 @@ def add_reconstruct(commands: Commands) -> None:
             "--vessel",
             bool,
             None,
-            "MBIR of an inset around a vessel with smooth outlines, which is drawn first: sharper, but disease with "
+            "MBIR of an inset around a vessel with smooth outlines, which is drawn first: "
+            "sharper, but disease with "
             "other outlines may be missing; what the drawing changed is written beside the volume",
         ),
         ("--tissues", bool, None, "MBIR that first fits the tissues of the vessel in the inset"),
-        ("--weights", Path, "FILE", "of MBIR, from your own training (default: those that ship)", {"read": True}),
+        (
+            "--weights",
+            Path,
+            "FILE",
+            "of MBIR, from your own training (default: those that ship)",
+            {"read": True},
+        ),
         ("--network", str, "MODULE:CLASS", "with --weights: the class of a network of your own"),
         (
             "--point",
@@ -664,19 +868,46 @@ def add_reconstruct(commands: Commands) -> None:
     )
     add_options(
         parser,
-        ("--voxel", float, "MM", "voxel size (default: the region's or the detector's)", {"limits": LENGTH}),
-        ("--center", _length, "MM", f"centre, Z Y X (default: region or axis); {own}",
-         {"nargs": "+", "limits": PLACE}),
-        ("--extent", _length, "MM", f"edge lengths, Z Y X (default: what is seen); {own}",
-         {"nargs": "+", "limits": LENGTH}),
-        ("--memory", _size, "SIZE", "limit of a process, e.g. 4GB, for volumes larger than memory: slab by slab, by "
-         "--workers too, to .nii or .zarr (default SCAN_METHOD.nii); after an interruption the same command goes on"),
+        (
+            "--voxel",
+            float,
+            "MM",
+            "voxel size (default: the region's or the detector's)",
+            {"limits": LENGTH},
+        ),
+        (
+            "--center",
+            _length,
+            "MM",
+            f"centre, Z Y X (default: region or axis); {own}",
+            {"nargs": "+", "limits": PLACE},
+        ),
+        (
+            "--extent",
+            _length,
+            "MM",
+            f"edge lengths, Z Y X (default: what is seen); {own}",
+            {"nargs": "+", "limits": LENGTH},
+        ),
+        (
+            "--memory",
+            _size,
+            "SIZE",
+            "limit of a process, e.g. 4GB, for volumes larger than memory: slab by slab, by "
+            "--workers too, to .nii or .zarr (default SCAN_METHOD.nii); after an interruption the "
+            "same command goes on",
+        ),
         group="voxels",
-    )  # fmt: skip
+    )
     _add_reader_options(parser, many=True)
     add_options(
         parser,
-        ("--find-axis", bool, None, "find the rotation axis: of a full turn, or half a turn of parallel rays"),
+        (
+            "--find-axis",
+            bool,
+            None,
+            "find the rotation axis: of a full turn, or half a turn of parallel rays",
+        ),
         ("--clean", bool, None, "take out stripes and outliers (parallel and fan beams)"),
         group="corrections of the scan",
     )
@@ -684,7 +915,7 @@ def add_reconstruct(commands: Commands) -> None:
     add_execution(parser, dry_run=False)
 
 
-# --- lower-dose ---------------------------------------------------------------------------------------------------
+# --- lower-dose -----------------------------------------------------------------------------------
 
 
 def _lower_dose(arguments: argparse.Namespace, progress: ProgressBars) -> None:
@@ -695,24 +926,45 @@ def _lower_dose(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     from torchpcct.formats.geometry_yaml import geometry_values
     from torchpcct.formats.scans import open_scan
 
-    scan = open_scan(arguments.scan, **_reader_options(arguments)).at_dose(arguments.fraction, arguments.seed)
+    scan = open_scan(arguments.scan, **_reader_options(arguments)).at_dose(
+        arguments.fraction, arguments.seed
+    )
     scan.save(arguments.out)
     note = scan.info["lower_dose"]
-    how = "photons thinned, exact" if note["exact"] else "mean and variance right, higher moments approximate"
-    short = f"{' × '.join(map(str, scan.counts.shape))} readings at {arguments.fraction:g} of the dose ({how})"
+    how = (
+        "photons thinned, exact"
+        if note["exact"]
+        else "mean and variance right, higher moments approximate"
+    )
+    short = (
+        f"{' × '.join(map(str, scan.counts.shape))} readings at {arguments.fraction:g} of the "
+        f"dose ({how})"
+    )
     config = {"scan": str(arguments.scan), "geometry": geometry_values(scan.geometry), **note}
-    tell(arguments, short, config, readings=list(scan.counts.shape), exposure_s=scan.exposure_s, **note)
+    tell(
+        arguments,
+        short,
+        config,
+        readings=list(scan.counts.shape),
+        exposure_s=scan.exposure_s,
+        **note,
+    )
 
 
 def add_lower_dose(commands: Commands) -> None:
     parser = command(
-        commands, "lower-dose", _lower_dose, "a measured scan as if it had been taken with less dose",
-        "Write a scan, ours or a foreign one, as it would have been at a fraction of its dose, noise included. Photon "
-        "counts are thinned, which is exact; other readings get the right mean and variance. Refused where the number "
+        commands,
+        "lower-dose",
+        _lower_dose,
+        "a measured scan as if it had been taken with less dose",
+        "Write a scan, ours or a foreign one, as it would have been at a fraction of its dose, "
+        "noise included. Photon "
+        "counts are thinned, which is exact; other readings get the right mean and variance. "
+        "Refused where the number "
         "of photons is not known.",
         "torchpcct lower-dose scan.h5 --fraction 0.25 --out quarter.h5",
         out="HDF5 file to write (default SCAN_FRACTION.h5)",
-    )  # fmt: skip
+    )
     _add_reader_options(parser)
     limits = {"positive": True, "high": 1.0}
     add_options(

@@ -22,7 +22,7 @@ __all__ = ["add_demo", "add_doctor", "add_train", "demo_steps", "train"]
 _DEMO_VIEWS = 984
 
 
-# --- demo ---------------------------------------------------------------------------------------------------------
+# --- demo -----------------------------------------------------------------------------------------
 
 
 def demo_steps(arguments: argparse.Namespace, run: Callable[[list[str]], int]) -> int:
@@ -41,14 +41,24 @@ def demo_steps(arguments: argparse.Namespace, run: Callable[[list[str]], int]) -
     except OSError as error:
         print(f"torchpcct demo: {error}", file=sys.stderr)
         return 2
-    scan, fbp, mbir, page = (str(folder / n) for n in ("scan.h5", "fbp.nii.gz", "mbir.nii.gz", "view.html"))
+    scan, fbp, mbir, page = (
+        str(folder / n) for n in ("scan.h5", "fbp.nii.gz", "mbir.nii.gz", "view.html")
+    )
     steps = (
-        (f"the paper's plaque scan, {_DEMO_VIEWS} views, 2 s of exposure",
-         ["simulate", "--exposure", "2", "--views", str(_DEMO_VIEWS), "--out", scan]),
-        ("filtered backprojection", ["reconstruct", scan, "--method", "fbp", "--kernel", "soft", "--out", fbp]),
+        (
+            f"the paper's plaque scan, {_DEMO_VIEWS} views, 2 s of exposure",
+            ["simulate", "--exposure", "2", "--views", str(_DEMO_VIEWS), "--out", scan],
+        ),
+        (
+            "filtered backprojection",
+            ["reconstruct", scan, "--method", "fbp", "--kernel", "soft", "--out", fbp],
+        ),
         ("model-based reconstruction", ["reconstruct", scan, "--method", "mbir", "--out", mbir]),
-        ("both in one page", ["view", fbp, mbir, "--level", "150", "--window", "600", "--html", page]),
-    )  # fmt: skip
+        (
+            "both in one page",
+            ["view", fbp, mbir, "--level", "150", "--window", "600", "--html", page],
+        ),
+    )
     start = time.perf_counter()
     for what, words in steps:
         words += ["--force"] * arguments.force
@@ -57,28 +67,36 @@ def demo_steps(arguments: argparse.Namespace, run: Callable[[list[str]], int]) -
             return status
         print(flush=True)
     print(
-        f"{time.perf_counter() - start:.0f} s in all. Open {page} in a browser: the paper looks for the dark core "
-        "beside the bright lumen.\nThe lines after $ do the same when you type them. What MBIR saves: torchpcct compare"
+        f"{time.perf_counter() - start:.0f} s in all. Open {page} in a browser: the paper looks "
+        "for the dark core "
+        "beside the bright lumen.\nThe lines after $ do the same when you type them. What MBIR "
+        "saves: torchpcct compare"
     )
     return 0
 
 
 def add_demo(commands: Commands) -> None:
     parser = commands.add_parser(
-        "demo", help="simulate a plaque scan, reconstruct it twice, look at it in the browser: 1 min",
-        description="Simulate the paper's plaque scan, reconstruct it by FBP and MBIR, write a page that shows both, "
-        "and print the commands that do this. Half a minute on two cores; the first time kernels are compiled, too.",
-    )  # fmt: skip
+        "demo",
+        help="simulate a plaque scan, reconstruct it twice, look at it in the browser: 1 min",
+        description="Simulate the paper's plaque scan, reconstruct it by FBP and MBIR, write a "
+        "page that shows both, "
+        "and print the commands that do this. Half a minute on two cores; the first time kernels "
+        "are compiled, too.",
+    )
     examples(parser, "torchpcct demo --out first_look")
     folder = {"default": Path("out/demo")}
-    add_options(parser, ("--out", Path, "FOLDER", "for the files (default out/demo)", folder), FORCE)
+    add_options(
+        parser, ("--out", Path, "FOLDER", "for the files (default out/demo)", folder), FORCE
+    )
 
 
-# --- train --------------------------------------------------------------------------------------------------------
+# --- train ----------------------------------------------------------------------------------------
 
 
 def train(words: list[str]) -> int:
-    """Run the training that was installed with this package, whatever folders ``train`` the user has.
+    """Run the training that was installed with this package, whatever folders ``train`` the user
+    has.
 
     By its path and not by an import statement: the training stands above this package.
 
@@ -104,10 +122,12 @@ def train(words: list[str]) -> int:
 
 def add_train(commands: Commands) -> None:
     """For the list of commands alone: ``train`` reads its own options."""
-    commands.add_parser("train", help="train the learned prior of MBIR (extra train)", add_help=False)
+    commands.add_parser(
+        "train", help="train the learned prior of MBIR (extra train)", add_help=False
+    )
 
 
-# --- doctor -------------------------------------------------------------------------------------------------------
+# --- doctor ---------------------------------------------------------------------------------------
 
 
 def _doctor(arguments: argparse.Namespace, progress: Any) -> int:
@@ -117,16 +137,23 @@ def _doctor(arguments: argparse.Namespace, progress: Any) -> int:
     for name, well, said in outcomes():
         broken += not well
         print(f"{'ok    ' if well else 'BROKEN'}  {name:<13} {said}", flush=True)
-    print("all is well" if not broken else f"{broken} broken; each line says what to do; paste this into an issue")
+    print(
+        "all is well"
+        if not broken
+        else f"{broken} broken; each line says what to do; paste this into an issue"
+    )
     return int(broken > 0)
 
 
 def add_doctor(commands: Commands) -> None:
     parser = commands.add_parser(
-        "doctor", help="is all installed, and does it compute what it should? seconds",
-        description="Print versions, processor, GPU, threads and the folder of compiled kernels, check the shipped "
-        "weights, test the projector's adjoint, and reconstruct a disc of known value: for an issue. Exit status 1 if "
+        "doctor",
+        help="is all installed, and does it compute what it should? seconds",
+        description="Print versions, processor, GPU, threads and the folder of compiled kernels, "
+        "check the shipped "
+        "weights, test the projector's adjoint, and reconstruct a disc of known value: for an "
+        "issue. Exit status 1 if "
         "something is broken, with its remedy.",
-    )  # fmt: skip
+    )
     examples(parser, "torchpcct doctor > doctor.txt")
     parser.set_defaults(run=_doctor, device="cpu", no_progress=True, verbose=False)

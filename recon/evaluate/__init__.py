@@ -1,17 +1,19 @@
-"""Measure any reconstruction at any task: how much dose does it save, and what does it do to the image?
+"""Measure any reconstruction at any task: how much dose does it save, and what does it do to the
+image?
 
-:func:`evaluate` runs tasks (:mod:`~recon.evaluate.task`, ready ones in :mod:`~recon.evaluate.tasks`) × methods
-(:mod:`~recon.evaluate.methods`) on the same noise realisations (:mod:`~recon.evaluate.draws`), reads the volumes
-(:mod:`~recon.evaluate.measure`) and gives figures with intervals (:mod:`~recon.evaluate.estimates`), of which
-:func:`save` makes a report. What every method has to beat is in :mod:`~recon.evaluate.rivals`: the strongest simple
+:func:`evaluate` runs tasks (:mod:`~recon.evaluate.task`, ready ones in
+:mod:`~recon.evaluate.tasks`) × methods (:mod:`~recon.evaluate.methods`) on the same noise
+realisations (:mod:`~recon.evaluate.draws`), reads the volumes (:mod:`~recon.evaluate.measure`) and
+gives figures with intervals (:mod:`~recon.evaluate.estimates`), of which :func:`save` makes a
+report. What every method has to beat is in :mod:`~recon.evaluate.rivals`: the strongest simple
 filters of a volume. Where nobody knows the truth: :func:`evaluate_scans`.
 
 Your denoiser on a lung nodule:
 
     from recon.evaluate import denoiser, evaluate, save
 
-    found = evaluate("nodule", ["mbir", denoiser(mine, "fbp:detail")], n=20, folder="out/mine/pieces")
-    save(found, "out/mine")
+    found = evaluate("nodule", ["mbir", denoiser(mine, "fbp:detail")], n=20,
+    folder="out/mine/pieces") save(found, "out/mine")
 """
 
 import importlib

@@ -1,12 +1,15 @@
-"""Anatomies that break assumptions: vessels with what a prior for vessels does not expect, painted with exact truths.
+"""Anatomies that break assumptions: vessels with what a prior for vessels does not expect, painted
+with exact truths.
 
-A reconstruction that knows what vessels look like may close an ulcer, flatten a thrombus or draw a wall that is not
-there. Each :class:`Anatomy` is a pair of scenes about the middle of an inset, with a feature and without it. On the
-same noise draw the difference of two volumes is what a method shows of the feature, and what it shows beside.
-:class:`recon.evaluate.tasks.AnatomyTask` measures it.
+A reconstruction that knows what vessels look like may close an ulcer, flatten a thrombus or draw a
+wall that is not there. Each :class:`Anatomy` is a pair of scenes about the middle of an inset, with
+a feature and without it. On the same noise draw the difference of two volumes is what a method
+shows of the feature, and what it shows beside. :class:`recon.evaluate.tasks.AnatomyTask` measures
+it.
 
-Scenes are made of parts, laid over each other in order. Shapes and CT numbers are our own choice of what coronary
-arteries look like on CT: lumens of 2 to 3 mm with 460 HU, walls of 0.2 mm, fat of -90 HU around.
+Scenes are made of parts, laid over each other in order. Shapes and CT numbers are our own choice of
+what coronary arteries look like on CT: lumens of 2 to 3 mm with 460 HU, walls of 0.2 mm, fat of -90
+HU around.
 """
 
 from __future__ import annotations
@@ -56,7 +59,8 @@ class Part:
 
     Args:
         tissue: a key of :data:`TISSUES_HU`.
-        inside: of coordinates towards the plaque, across, along the vessel (mm, arrays of one shape) → bool.
+        inside: of coordinates towards the plaque, across, along the vessel (mm, arrays of one
+            shape) → bool.
         over: tissues that it replaces; empty: all.
     """
 
@@ -89,8 +93,8 @@ class Anatomy:
         return {**TISSUES_HU, **self.hu}
 
     def labels(self, points: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Index of the tissue in :attr:`values` with and without the feature, at points ``(..., 3)`` x, y, z in mm
-        about the inset's middle."""
+        """Index of the tissue in :attr:`values` with and without the feature, at points ``(...,
+        3)`` x, y, z in mm about the inset's middle."""
         names, local = list(self.values), np.moveaxis(self.line.local(points), -1, 0)
 
         def laid(over: NDArray[np.int64], parts: tuple[Part, ...]) -> NDArray[np.int64]:
@@ -108,14 +112,20 @@ class Anatomy:
     def shares(self, grid: VolumeGrid) -> dict[tuple[str, str], Floats]:
         """(tissue with the feature, tissue without it) → its share of each voxel ``grid.shape``.
 
-        See :func:`torchpcct.scene.raster.label_fractions`; ``grid`` is about the inset's middle as its origin.
+        See :func:`torchpcct.scene.raster.label_fractions`; ``grid`` is about the inset's middle as
+        its origin.
         """
         from torchpcct.scene.raster import label_fractions  # its kernels need numba, a slow import
 
         names = list(self.values)
         before = [*dict.fromkeys(["fat", *(part.tissue for part in self.base)])]
-        # A part of the feature may lie over another one of it, and so over whatever that has replaced.
-        pairs = [*dict.fromkeys([*((t, t) for t in before), *((p.tissue, t) for p in self.feature for t in before)])]
+        # A part of the feature may lie over another one of it, and so over whatever that has
+        # replaced.
+        pairs = [
+            *dict.fromkeys(
+                [*((t, t) for t in before), *((p.tissue, t) for p in self.feature for t in before)]
+            )
+        ]
         index = np.full((len(names), len(names)), -1)
         for k, (after, without) in enumerate(pairs):
             index[names.index(after), names.index(without)] = k
@@ -131,9 +141,12 @@ class Anatomy:
         return result
 
 
-# --- shapes, in the vessel's coordinates: a towards the plaque, b across, s along -----------------------------------
+# --- shapes, in the vessel's coordinates: a towards the plaque, b across, s along -----------------
 
-_R, _WALL, _LUMEN, _HALF = 1.75, 0.2, 1.4, 4.4
+_R = 1.75
+_WALL = 0.2
+_LUMEN = 1.4
+_HALF = 4.4
 """Radius of the healthy vessel, its wall, radius of its lumen, half of its length, mm."""
 _PLAQUE = Plaque(
     position=(0.0, 0.0, 0.0),
@@ -147,7 +160,12 @@ _PLAQUE = Plaque(
 )
 
 
-def _tube(radius: float | Callable[[Floats], Floats], half: float = _HALF, a0: float = 0.0, b0: float = 0.0) -> Inside:
+def _tube(
+    radius: float | Callable[[Floats], Floats],
+    half: float = _HALF,
+    a0: float = 0.0,
+    b0: float = 0.0,
+) -> Inside:
     """A round tube; its radius may change along it."""
 
     def inside(a: Floats, b: Floats, s: Floats) -> Bools:
@@ -161,7 +179,9 @@ def _ball(centre: Sequence[float], semi_axes: float | Sequence[float]) -> Inside
     c, r = centre, np.broadcast_to(np.asarray(semi_axes, float), 3)
 
     def inside(a: Floats, b: Floats, s: Floats) -> Bools:
-        return np.asarray(((a - c[0]) / r[0]) ** 2 + ((b - c[1]) / r[1]) ** 2 + ((s - c[2]) / r[2]) ** 2 < 1.0)
+        return np.asarray(
+            ((a - c[0]) / r[0]) ** 2 + ((b - c[1]) / r[1]) ** 2 + ((s - c[2]) / r[2]) ** 2 < 1.0
+        )
 
     return inside
 
@@ -186,7 +206,9 @@ def _rod(start: Sequence[float], along: Sequence[float], radius: float, length: 
     return inside
 
 
-def _vessel(radius: float = _R, lumen: float | Callable[[Floats], Floats] = _LUMEN, half: float = _HALF) -> list[Part]:
+def _vessel(
+    radius: float = _R, lumen: float | Callable[[Floats], Floats] = _LUMEN, half: float = _HALF
+) -> list[Part]:
     """A healthy vessel: wall, thin intima, lumen."""
     return [
         Part("wall", _tube(radius, half)),
@@ -207,7 +229,9 @@ def _core(tissue: str = "core", plaque: Plaque = _PLAQUE) -> list[Part]:
     return [Part(tissue, _within_shape(plaque.core), ("fibrous",))]
 
 
-def _second(distance: float, tilt: float, tissue: str = "lumen", radius: float = 0.95) -> list[Part]:
+def _second(
+    distance: float, tilt: float, tissue: str = "lumen", radius: float = 0.95
+) -> list[Part]:
     """Another vessel beside, its axis ``distance`` mm off on the side of the plaque."""
     u = (0.0, math.sin(tilt), math.cos(tilt))
     start, length = (distance, -4.0 * u[1], -4.0 * u[2]), 8.0
@@ -227,7 +251,8 @@ def _narrowing(depth: float, length: float) -> Callable[[Floats], Floats]:
 
 
 def _struts(a: Floats, b: Floats, s: Floats) -> Bools:
-    """A stent of zigzag rings of 0.11 mm wire (square section) against the lumen's wall, three links between rings."""
+    """A stent of zigzag rings of 0.11 mm wire (square section) against the lumen's wall, three
+    links between rings."""
     r, turn = np.hypot(a, b), np.arctan2(b, a) / (2.0 * math.pi)
     shell = np.abs(r - (_LUMEN - 0.075)) < 0.055
     zigzag = 0.3 * np.abs(np.mod(6.0 * turn, 1.0) * 4.0 - 2.0)
@@ -247,13 +272,16 @@ _PAPER_HU = {"wall": 63.5, "fibrous": 103.2, "lumen": 480.0, "core": 41.1}
 """The plaque of the paper, and what its tissues read on its scanner."""
 _BENT = Centreline((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), 3.5)
 
-_HEALTHY, _WITH_PLAQUE = tuple(_vessel()), tuple(_plaque())
+_HEALTHY = tuple(_vessel())
+_WITH_PLAQUE = tuple(_plaque())
 
 ANATOMIES: dict[str, Anatomy] = {
     "healthy": Anatomy("a healthy vessel in fat, nothing more", (), _HEALTHY),
     "core": Anatomy("a necrotic core in an eccentric plaque", _WITH_PLAQUE, tuple(_core())),
     "lipid_core": Anatomy("a core of lipid", _WITH_PLAQUE, tuple(_core("lipid"))),
-    "thin_cap": Anatomy("a necrotic core under a cap of 0.12 mm", tuple(_plaque(_THIN)), tuple(_core(plaque=_THIN))),
+    "thin_cap": Anatomy(
+        "a necrotic core under a cap of 0.12 mm", tuple(_plaque(_THIN)), tuple(_core(plaque=_THIN))
+    ),
     "ulcer": Anatomy(
         "a crater of 1 mm in the plaque, open to the lumen",
         _WITH_PLAQUE,
@@ -270,7 +298,9 @@ ANATOMIES: dict[str, Anatomy] = {
         (
             Part(
                 "flap",
-                lambda a, b, s: (np.abs(0.8 * a + 0.6 * b - 0.25 - 0.08 * s) < 0.14) & (np.abs(s) < 2.6),
+                lambda a, b, s: (
+                    (np.abs(0.8 * a + 0.6 * b - 0.25 - 0.08 * s) < 0.14) & (np.abs(s) < 2.6)
+                ),
                 ("lumen",),
             ),
         ),
@@ -280,9 +310,13 @@ ANATOMIES: dict[str, Anatomy] = {
         _HEALTHY,
         (Part("calcium", _ball((-1.1, -1.1, 0.4), 0.25), ("wall", "fibrous")),),
     ),
-    "stent": Anatomy("a stent of wires of 0.11 mm", _HEALTHY, (Part("metal", _struts, ("lumen",)),)),
+    "stent": Anatomy(
+        "a stent of wires of 0.11 mm", _HEALTHY, (Part("metal", _struts, ("lumen",)),)
+    ),
     "inflamed_30": Anatomy(
-        "fat inflamed by 30 HU in a ring of 1 mm", _HEALTHY, (Part("inflamed", _tube(_R + 1.0), ("fat",)),)
+        "fat inflamed by 30 HU in a ring of 1 mm",
+        _HEALTHY,
+        (Part("inflamed", _tube(_R + 1.0), ("fat",)),),
     ),
     "inflamed_15": Anatomy(
         "fat inflamed by 15 HU in a ring of 1 mm",
@@ -299,7 +333,9 @@ ANATOMIES: dict[str, Anatomy] = {
         ),
     ),
     "touching": Anatomy(
-        "a vessel that touches, crossing at a right angle", _HEALTHY, tuple(_second(_R + 0.95, math.pi / 2))
+        "a vessel that touches, crossing at a right angle",
+        _HEALTHY,
+        tuple(_second(_R + 0.95, math.pi / 2)),
     ),
     "second": Anatomy(
         "a vein of 1.6 mm alongside, 0.8 mm off",
@@ -307,9 +343,13 @@ ANATOMIES: dict[str, Anatomy] = {
         tuple(_second(_R + 0.8 + 0.8, 0.15, tissue="vein", radius=0.8)),
     ),
     "muscle_2mm": Anatomy(
-        "a necrotic core, muscle 2 mm off the vessel", (*_WITH_PLAQUE, *_muscle(_R + 2.0)), tuple(_core())
+        "a necrotic core, muscle 2 mm off the vessel",
+        (*_WITH_PLAQUE, *_muscle(_R + 2.0)),
+        tuple(_core()),
     ),
-    "muscle_touching": Anatomy("a necrotic core, muscle that touches", (*_WITH_PLAQUE, *_muscle(_R)), tuple(_core())),
+    "muscle_touching": Anatomy(
+        "a necrotic core, muscle that touches", (*_WITH_PLAQUE, *_muscle(_R)), tuple(_core())
+    ),
     "paper_muscle_2mm": Anatomy(
         "the paper's plaque, muscle 2 mm off the vessel",
         (*_plaque(_PAPER), *_muscle(_PAPER.vessel_diameter / 2 + 2.0)),
@@ -348,9 +388,14 @@ ANATOMIES: dict[str, Anatomy] = {
         (Part("thrombus", lambda a, b, s: s > 0.35 + 0.15 * a, ("lumen",)),),
     ),
     "low_enhancement": Anatomy(
-        "a necrotic core, the lumen enhanced to 160 HU", _WITH_PLAQUE, tuple(_core()), hu={"lumen": 160.0}
+        "a necrotic core, the lumen enhanced to 160 HU",
+        _WITH_PLAQUE,
+        tuple(_core()),
+        hu={"lumen": 160.0},
     ),
-    "curved": Anatomy("a necrotic core in a vessel bent with 3.5 mm", _WITH_PLAQUE, tuple(_core()), line=_BENT),
+    "curved": Anatomy(
+        "a necrotic core in a vessel bent with 3.5 mm", _WITH_PLAQUE, tuple(_core()), line=_BENT
+    ),
 }
 """By name."""
 

@@ -1,9 +1,11 @@
-"""Noise realisations of a task: one noisy scan with the signal and one without, and what methods take of them.
+"""Noise realisations of a task: one noisy scan with the signal and one without, and what methods
+take of them.
 
-Realisation k draws the readings with the seed ``seed + k``, the same at every exposure and for every method. The scan
-without the signal carries the same relative noise: its line integrals before linearisation differ from the scan's by
-what the signal changes without noise. (The counts behind a signal that is worth looking for differ by a few per cent at
-most.) So what is linear is computed once, and the signal's noise-free part added.
+Realisation k draws the readings with the seed ``seed + k``, the same at every exposure and for
+every method. The scan without the signal carries the same relative noise: its line integrals before
+linearisation differ from the scan's by what the signal changes without noise. (The counts behind a
+signal that is worth looking for differ by a few per cent at most.) So what is linear is computed
+once, and the signal's noise-free part added.
 """
 
 from __future__ import annotations
@@ -48,7 +50,9 @@ class Draws:
         kernels: of FBP that methods ask for.
     """
 
-    def __init__(self, task: Task, store: Store, seed: int = 0, kernels: Sequence[str] = ()) -> None:
+    def __init__(
+        self, task: Task, store: Store, seed: int = 0, kernels: Sequence[str] = ()
+    ) -> None:
         self.task, self.store, self.seed = task, store, seed
         self.kernels = tuple(dict.fromkeys(kernels))
 
@@ -60,7 +64,9 @@ class Draws:
     @cached_property
     def facts(self) -> Facts:
         """Of the task."""
-        found: Facts = self.store.piece("facts", f"1 {self.task.fingerprint}", lambda: self.task.facts(self.store))
+        found: Facts = self.store.piece(
+            "facts", f"1 {self.task.fingerprint}", lambda: self.task.facts(self.store)
+        )
         return found
 
     @cached_property
@@ -75,7 +81,8 @@ class Draws:
 
     @cached_property
     def clean_fbp(self) -> tuple[Tensor, Tensor]:
-        """FBP without noise, with and without the signal, ``(kernels, z, y, x)`` HU; the same at every exposure."""
+        """FBP without noise, with and without the signal, ``(kernels, z, y, x)`` HU; the same at
+        every exposure."""
         return self.filtered(self.clean[0])[0], self.filtered(self.clean[1])[0]
 
     @cached_property
@@ -84,16 +91,22 @@ class Draws:
         return self.problem.statistic(self.clean[0]).b, self.problem.statistic(self.clean[1]).b
 
     def exact_covariances(self, kernels: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-        """Of the ROI means of FBP at 1 s, kernel → ``(rois, 2, rois, 2)`` HU²; it falls as 1 / exposure."""
+        """Of the ROI means of FBP at 1 s, kernel → ``(rois, 2, rois, 2)`` HU²; it falls as 1 /
+        exposure."""
         regions, key = self.task.regions, f"1 {self.task.fingerprint}"
-        functionals: list[Any] = [SimpleNamespace(weights=w) for pair in regions.values() for w in pair]
+        functionals: list[Any] = [
+            SimpleNamespace(weights=w) for pair in regions.values() for w in pair
+        ]
 
         @cache
         def together() -> dict[str, NDArray[np.float64]]:
             # What costs most, the transposed backprojection, is the same for all kernels.
             fbp = InsetFbp(self.clean[0], [self.task.grid], kernels)
             found = roi_covariance(self.clean[0], fbp, [functionals], NOISE_FREE_EXPOSURE_S)[0]
-            return {k: c.reshape(len(regions), 2, len(regions), 2) for k, c in zip(kernels, found, strict=True)}
+            return {
+                k: c.reshape(len(regions), 2, len(regions), 2)
+                for k, c in zip(kernels, found, strict=True)
+            }
 
         def of(kernel: str) -> NDArray[np.float64]:
             return together()[kernel]
@@ -101,15 +114,26 @@ class Draws:
         return {k: self.store.piece(f"exact_{k}", key, partial(of, k)) for k in kernels}
 
     def response(self, network: Mbir, reader: Any, exposure_s: float) -> dict[str, Any]:
-        """``adjoints`` ``(2 · rois, z, y, x)`` of MBIR's ROI means, ``mean`` and ``covariance`` of what they give."""
+        """``adjoints`` ``(2 · rois, z, y, x)`` of MBIR's ROI means, ``mean`` and ``covariance``
+        of what they give."""
         both = [self.noise_free(p, exposure_s).statistic for p in (True, False)]
         g = response(
-            lambda b: network(self.problem, b, exposure_s), self.problem, reader.weights, both[0], exposure_s
-        )  # fmt: skip
+            lambda b: network(self.problem, b, exposure_s),
+            self.problem,
+            reader.weights,
+            both[0],
+            exposure_s,
+        )
         covariance = statistic_covariance(self.problem, g, exposure_s, self.clean[0])
         rois = len(g) // 2
-        mean = np.stack([torch.einsum("zyx,rzyx->r", b.double(), g).numpy().reshape(rois, 2) for b in both])
-        return {"adjoints": g.numpy(), "mean": mean, "covariance": covariance.reshape(rois, 2, rois, 2)}
+        mean = np.stack(
+            [torch.einsum("zyx,rzyx->r", b.double(), g).numpy().reshape(rois, 2) for b in both]
+        )
+        return {
+            "adjoints": g.numpy(),
+            "mean": mean,
+            "covariance": covariance.reshape(rois, 2, rois, 2),
+        }
 
     def noise_free(self, present: bool, exposure_s: float) -> Simulated:
         """Without noise; ``exposure_s`` is what a method is told."""
@@ -127,16 +151,24 @@ class Draws:
         def compute() -> float:
             largest = max(self.task.flat, key=lambda t: len(self.task.flat[t]), default=None)
             if largest is None:
-                raise ValueError(f"task {self.task.name}: no tissue fills a flat part of the inset: enlarge it")
+                raise ValueError(
+                    f"task {self.task.name}: no tissue fills a flat part of the inset: enlarge it"
+                )
             clean = method.run(self.noise_free(True, exposure_s))
             found = [
-                noise_of(method.run(self.draw(exposure_s, k)[0]) - clean, self.task.flat[largest], smooths)
+                noise_of(
+                    method.run(self.draw(exposure_s, k)[0]) - clean,
+                    self.task.flat[largest],
+                    smooths,
+                )
                 for k in _SIGMA_SEEDS
             ]
             return float(np.sqrt(np.mean(np.square(found))))
 
         name = f"sigma_{method.kernels[0]}_{exposure_s:g}s_{smooths:g}"
-        return float(self.store.piece(name, f"1 {exposure_s} {smooths} {self.task.fingerprint}", compute))
+        return float(
+            self.store.piece(name, f"1 {exposure_s} {smooths} {self.task.fingerprint}", compute)
+        )
 
 
 class Simulated:
@@ -144,7 +176,8 @@ class Simulated:
 
     Attributes:
         exposure_s: of the scan; grid: of the volume; label: for files.
-        drawn, warned: whether MBIR has drawn a vessel, and has warned of something; None: it was not asked.
+        drawn, warned: whether MBIR has drawn a vessel, and has warned of something; None: it was
+            not asked.
     """
 
     def __init__(
@@ -168,7 +201,8 @@ class Simulated:
     @property
     def label(self) -> str:
         number = "clean" if self.k < 0 else f"{self.k:03d}"
-        return f"{self._draws.task.name}/{self.exposure_s:g}s_{number}_{'present' if self.present else 'absent'}"
+        state = "present" if self.present else "absent"
+        return f"{self._draws.task.name}/{self.exposure_s:g}s_{number}_{state}"
 
     @property
     def problem(self) -> InsetProblem:
@@ -182,7 +216,10 @@ class Simulated:
             return self._scan
         assert self._with_signal is not None
         present, absent = self._draws.clean
-        return replace(self._with_signal.scan, counts=self._with_signal.scan.counts * (absent.counts / present.counts))
+        return replace(
+            self._with_signal.scan,
+            counts=self._with_signal.scan.counts * (absent.counts / present.counts),
+        )
 
     @cached_property
     def _fbp(self) -> Tensor:
@@ -196,7 +233,10 @@ class Simulated:
     def fbp(self, kernel: str) -> Tensor:
         """HU ``(z, y, x)``."""
         if kernel not in self._draws.kernels:
-            raise ValueError(f"FBP with the kernel {kernel!r} was not announced: Method(..., kernels=({kernel!r},))")
+            raise ValueError(
+                f"FBP with the kernel {kernel!r} was not announced: Method(..., "
+                f"kernels=({kernel!r},))"
+            )
         return self._fbp[self._draws.kernels.index(kernel)]
 
     @cached_property
@@ -210,7 +250,8 @@ class Simulated:
         return self.problem.statistic(self.scan).b
 
     def pwls(self) -> Tensor:
-        """HU ``(z, y, x)``, as :func:`recon.reconstruct` gives it: exact projection pairs, its prior and tolerance."""
+        """HU ``(z, y, x)``, as :func:`recon.reconstruct` gives it: exact projection pairs, its
+        prior and tolerance."""
         problem = self.problem
         with torch.no_grad():
             found = problem.solve_statistic(

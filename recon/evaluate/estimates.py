@@ -1,22 +1,28 @@
 """From readings to figures with intervals, and to dose factors.
 
-One rule makes every dose factor: of two methods the one whose figure is larger sees what the other needs more dose for,
-and every figure here (noise variance, variance of a contrast at slope 1, CNR², d′²) is proportional to the dose for a
-linear method. So the factor is the ratio of the method's figure to the linear reference's at the same dose. Both are of
-the same noise realisations, so what is luck of the draws cancels in the ratio; intervals are jackknife intervals over
-realisations (:mod:`torchpcct.metrics.intervals`). What is drawn is controlled (:mod:`torchpcct.metrics.control`) by
-linear functionals of the same noise, whose moments are exactly known: of MBIR by its own response
-(:mod:`recon.evaluate.response`), of other methods by the reference's ROI means. Of FBP all but noise and d′ is exact.
+One rule makes every dose factor: of two methods the one whose figure is larger sees what the other
+needs more dose for, and every figure here (noise variance, variance of a contrast at slope 1, CNR²,
+d′²) is proportional to the dose for a linear method. So the factor is the ratio of the method's
+figure to the linear reference's at the same dose. Both are of the same noise realisations, so what
+is luck of the draws cancels in the ratio; intervals are jackknife intervals over realisations
+(:mod:`torchpcct.metrics.intervals`). What is drawn is controlled (:mod:`torchpcct.metrics.control`)
+by linear functionals of the same noise, whose moments are exactly known: of MBIR by its own
+response (:mod:`recon.evaluate.response`), of other methods by the reference's ROI means. Of FBP all
+but noise and d′ is exact.
 
-* slope: contrast that the signal adds over the true one; a method may buy low noise with it, so contrasts are compared
-  at slope 1: variance over slope²;
-* ``without signal``: contrast that is read where there is none (less what other tissues in the ROIs make);
+* slope: contrast that the signal adds over the true one; a method may buy low noise with it, so
+  contrasts are compared at slope 1: variance over slope²;
+* ``without signal``: contrast that is read where there is none (less what other tissues in the ROIs
+  make);
 * the paper's CNR: (background − signal) / √(σ² + σ²) of the ROI means over realisations;
-* d′: a Hotelling observer on the channels of :class:`recon.evaluate.measure.Reader`, trained on the other pairs;
-* invented contrast: where one tissue is so far from all edges that their blur does not reach, the error should have no
-  sign. Of two halves of the realisations one names the hundredth of the voxels with the largest mean errors, the other
-  tells its own mean error there, in their direction; so what is noise adds nothing on average;
-* false contour: the mean error's largest fall over 0.4 mm with the distance from the bodies, where no border is;
+* d′: a Hotelling observer on the channels of :class:`recon.evaluate.measure.Reader`, trained on the
+  other pairs;
+* invented contrast: where one tissue is so far from all edges that their blur does not reach, the
+  error should have no sign. Of two halves of the realisations one names the hundredth of the voxels
+  with the largest mean errors, the other tells its own mean error there, in their direction; so
+  what is noise adds nothing on average;
+* false contour: the mean error's largest fall over 0.4 mm with the distance from the bodies, where
+  no border is;
 * limit: the variance of the best unbiased estimate if all outlines were known, the same ratio.
 """
 
@@ -44,8 +50,10 @@ _CONTRAST = (-1.0, 1.0)
 """Background less signal."""
 _LEAST_SLOPE = 0.05
 """Less contrast than that of the true one cannot be corrected for."""
-_SHARE, _ENOUGH = 0.01, 200
-"""Of the voxels where nothing is, the share in which something is looked for; so many there must be."""
+_SHARE = 0.01
+_ENOUGH = 200
+"""Of the voxels where nothing is, the share in which something is looked for; so many there must
+be."""
 
 
 Figure = Jackknifed | float
@@ -75,13 +83,25 @@ class _Figures:
         true: ``(rois,)`` contrasts that the signal adds, HU: background less signal.
         absent: ``(rois,)`` true contrasts without the signal, HU.
         reference: on the same draws; what is drawn is controlled by it.
-        exact: the method's own covariance of ROI means as :attr:`Known.covariance`; None: it is drawn.
+        exact: the method's own covariance of ROI means as :attr:`Known.covariance`; None: it is
+            drawn.
     """
 
     def __init__(
-        self, readings: Readings, true: Floats, absent: Floats, reference: Known, exact: Floats | None
+        self,
+        readings: Readings,
+        true: Floats,
+        absent: Floats,
+        reference: Known,
+        exact: Floats | None,
     ) -> None:
-        self.r, self.true, self.absent, self.reference, self.exact = readings, true, absent, reference, exact
+        self.r, self.true, self.absent, self.reference, self.exact = (
+            readings,
+            true,
+            absent,
+            reference,
+            exact,
+        )
         self._sign = np.sign(true)
 
     def _row(self, roi: int, row: Any) -> Floats:
@@ -95,15 +115,20 @@ class _Figures:
         if self.exact is not None:
             return float((weights * self.r.clean_rois[without_signal]).sum())
         values, control = (
-            np.einsum("nrs,rs->n", v[:, without_signal], weights) for v in (self.r.rois, self.reference.draws)
+            np.einsum("nrs,rs->n", v[:, without_signal], weights)
+            for v in (self.r.rois, self.reference.draws)
         )
-        return controlled_mean(values, control, float((weights * self.reference.mean[without_signal]).sum()))
+        return controlled_mean(
+            values, control, float((weights * self.reference.mean[without_signal]).sum())
+        )
 
     def log_variance(self, weights: Floats) -> Figure:
         """ln of its variance with the signal."""
         if self.exact is not None:
             return math.log(float(np.einsum("rs,rstu,tu->", weights, self.exact, weights)))
-        values, control = (np.einsum("nrs,rs->n", v[:, 0], weights) for v in (self.r.rois, self.reference.draws))
+        values, control = (
+            np.einsum("nrs,rs->n", v[:, 0], weights) for v in (self.r.rois, self.reference.draws)
+        )
         known = float(np.einsum("rs,rstu,tu->", weights, self.reference.covariance, weights))
         return controlled_log_variance(values, control, known)
 
@@ -112,26 +137,35 @@ class _Figures:
         row, true = self._row(roi, _CONTRAST), float(self.true[roi])
         if self.exact is not None:
             return float(((self.r.clean_rois[0] - self.r.clean_rois[1]) * row).sum()) / true
-        return joint(lambda m: m / true, _mean(np.einsum("nrs,rs->n", self.r.rois[:, 0] - self.r.rois[:, 1], row)))
+        return joint(
+            lambda m: m / true,
+            _mean(np.einsum("nrs,rs->n", self.r.rois[:, 0] - self.r.rois[:, 1], row)),
+        )
 
     def without(self, roi: int) -> Figure:
         """Contrast beyond what there is without the signal, in the direction of the true one."""
         known = self.absent[roi]
-        return joint(lambda m: (m - known) * self._sign[roi], self.mean(self._row(roi, _CONTRAST), 1))
+        return joint(
+            lambda m: (m - known) * self._sign[roi], self.mean(self._row(roi, _CONTRAST), 1)
+        )
 
     def log_corrected(self, roi: int) -> Figure:
         """ln of the contrast's variance at slope 1."""
         return joint(
-            lambda v, s: v - 2.0 * np.log(np.abs(s)), self.log_variance(self._row(roi, _CONTRAST)), self.slope(roi)
+            lambda v, s: v - 2.0 * np.log(np.abs(s)),
+            self.log_variance(self._row(roi, _CONTRAST)),
+            self.slope(roi),
         )
 
     def cnr(self, roi: int) -> Figure:
         """The paper's."""
         sign = self._sign[roi]
         return joint(
-            lambda c, a, b: sign * c / np.sqrt(np.exp(a) + np.exp(b)), self.mean(self._row(roi, _CONTRAST), 0),
-            self.log_variance(self._row(roi, (1.0, 0.0))), self.log_variance(self._row(roi, (0.0, 1.0))),
-        )  # fmt: skip
+            lambda c, a, b: sign * c / np.sqrt(np.exp(a) + np.exp(b)),
+            self.mean(self._row(roi, _CONTRAST), 0),
+            self.log_variance(self._row(roi, (1.0, 0.0))),
+            self.log_variance(self._row(roi, (0.0, 1.0))),
+        )
 
     def log_noise(self, tissue: str) -> Jackknifed:
         """ln of a voxel's variance in a flat tissue."""
@@ -158,14 +192,18 @@ class _Figures:
 
         errors, index = self.r.invented.astype(np.float64), np.arange(self.r.n)
         halves = index[::2], index[1::2]
-        left_out = [both(errors, (halves[0][halves[0] != k], halves[1][halves[1] != k])) for k in index]
+        left_out = [
+            both(errors, (halves[0][halves[0] != k], halves[1][halves[1] != k])) for k in index
+        ]
         return Jackknifed(both(errors, halves), np.array(left_out))
 
     def contour(self) -> Jackknifed:
         """See the module, HU."""
         shells, n = self.r.shells, self.r.n
         mean = shells.mean(0)
-        return Jackknifed(_fall(mean), np.array([_fall((n * mean - own) / (n - 1)) for own in shells]))
+        return Jackknifed(
+            _fall(mean), np.array([_fall((n * mean - own) / (n - 1)) for own in shells])
+        )
 
 
 def _confirmed(found: Floats, other: Floats) -> float:
@@ -189,10 +227,20 @@ def joint(function: Callable[..., Any], *figures: Figure) -> Figure:
 
 
 def records_of(
-    task: str, method: str, exposure_s: float, readings: Readings, base: Readings, reference: Known, facts: Facts,
-    true: Floats, absent: Floats, rois: tuple[str, ...], exact: Floats | None = None,
-) -> list[Record]:  # fmt: skip
-    """All figures of a method at an exposure, one record each: task, method, exposure, figure, where, value, interval.
+    task: str,
+    method: str,
+    exposure_s: float,
+    readings: Readings,
+    base: Readings,
+    reference: Known,
+    facts: Facts,
+    true: Floats,
+    absent: Floats,
+    rois: tuple[str, ...],
+    exact: Floats | None = None,
+) -> list[Record]:
+    """All figures of a method at an exposure, one record each: task, method, exposure, figure,
+    where, value, interval.
 
     Args:
         task, method, exposure_s: what was measured.
@@ -214,17 +262,29 @@ def records_of(
     )
     found: list[Record] = []
 
-    def add(figure: str, where: str, value: Any, unit: str = "", transform: float | None = None) -> None:
+    def add(
+        figure: str, where: str, value: Any, unit: str = "", transform: float | None = None
+    ) -> None:
         """``transform`` t: of a logarithm, exp(t · value)."""
         if isinstance(value, Jackknifed):
             made = value.estimate() if transform is None else value.exponential(scale=transform)
         else:
             exactly = float(value) if transform is None else math.exp(transform * float(value))
             made = Estimate(exactly, math.nan, math.nan)
-        found.append({
-            "task": task, "method": method, "exposure_s": exposure_s, "figure": figure, "where": where,
-            "value": made.value, "low": made.low, "high": made.high, "unit": unit, "n": readings.n,
-        })  # fmt: skip
+        found.append(
+            {
+                "task": task,
+                "method": method,
+                "exposure_s": exposure_s,
+                "figure": figure,
+                "where": where,
+                "value": made.value,
+                "low": made.low,
+                "high": made.high,
+                "unit": unit,
+                "n": readings.n,
+            }
+        )
 
     def factor(figure: str, where: str, above: Figure, below: Figure) -> None:
         add(f"dose factor: {figure}", where, joint(lambda a, b: a - b, above, below), transform=1.0)
@@ -259,7 +319,10 @@ def records_of(
         if d is not None and e is not None and d.value > 0 and e.value > 0:
             factor("d'", observer, _log_square(d), _log_square(e))
     add("seconds", "a volume", readings.seconds, "s")
-    for figure, shares in (("share drawn", readings.drawn), ("share with a warning", readings.warned)):
+    for figure, shares in (
+        ("share drawn", readings.drawn),
+        ("share with a warning", readings.warned),
+    ):
         for where, share in zip(("with the signal", "without the signal"), shares, strict=True):
             if not math.isnan(share):
                 add(figure, where, share)

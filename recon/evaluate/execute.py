@@ -1,15 +1,18 @@
 """Jobs in other processes and on other machines, through any :class:`concurrent.futures.Executor`.
 
-A job computes files of a folder (pieces of a :class:`~recon.evaluate.store.Store`, volumes); afterwards the one program
-that everybody knows reads them and goes on, as if it had computed them itself before it was interrupted. So what comes
-out does not depend on where it was computed, and whatever dies, nothing finished is lost.
+A job computes files of a folder (pieces of a :class:`~recon.evaluate.store.Store`, volumes);
+afterwards the one program that everybody knows reads them and goes on, as if it had computed them
+itself before it was interrupted. So what comes out does not depend on where it was computed, and
+whatever dies, nothing finished is lost.
 
 * serial: no executor;
-* :class:`Processes`: of this machine (spawned), one job each at a time; a process that dies takes its own job alone;
-* :class:`Cluster`: the workers of a Dask scheduler. Who repeats a job of a worker that died is Dask.
+* :class:`Processes`: of this machine (spawned), one job each at a time; a process that dies takes
+  its own job alone;
+* :class:`Cluster`: the workers of a Dask scheduler. Who repeats a job of a worker that died is
+  Dask.
 
-Where a worker sees the folder (the disk is shared) it writes there; where it does not, it computes in a folder of its
-own, and the files come back with the job's result.
+Where a worker sees the folder (the disk is shared) it writes there; where it does not, it computes
+in a folder of its own, and the files come back with the job's result.
 """
 
 from __future__ import annotations
@@ -30,7 +33,14 @@ import threading
 import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+)
 from concurrent.futures import ProcessPoolExecutor as Pool
 from concurrent.futures import wait as wait_for
 from contextvars import ContextVar
@@ -93,7 +103,8 @@ class Unportable(TypeError):
 
 
 class Unfit(ValueError):
-    """A worker that cannot take jobs, named: its torchpcct is another one, it takes several at once, its disk is full.
+    """A worker that cannot take jobs, named: its torchpcct is another one, it takes several at
+    once, its disk is full.
 
     Args:
         worker: its address.
@@ -110,11 +121,14 @@ class Job:
 
     Args:
         name: unique; it says to people what it is.
-        function: of a module, called as ``function(folder, *args)``; it writes into ``folder`` what is not there yet.
+        function: of a module, called as ``function(folder, *args)``; it writes into ``folder`` what
+            is not there yet.
         args: to be pickled; all that the result depends on, seeds too.
-        makes: patterns of the files in ``folder`` that are wanted back from a disk that is not shared.
+        makes: patterns of the files in ``folder`` that are wanted back from a disk that is not
+            shared.
         after: names of jobs that have to be done before.
-        module: the one whose sources, with all they import, must be the worker's; empty: that of ``function``.
+        module: the one whose sources, with all they import, must be the worker's; empty: that of
+            ``function``.
         seconds, mib, bytes: expected on one core, in memory, and on the disk; 0: not known.
     """
 
@@ -153,14 +167,15 @@ class _Done:
     said: list[str] = field(default_factory=list)
 
 
-# --- where jobs are run -------------------------------------------------------------------------------------------
+# --- where jobs are run ---------------------------------------------------------------------------
 
 
 _current: ContextVar[Executor | None] = ContextVar("executor", default=None)
 
 
 def current() -> Executor | None:
-    """The executor of the innermost :func:`using`; None: everything is computed here, one after another."""
+    """The executor of the innermost :func:`using`; None: everything is computed here, one after
+    another."""
     return _current.get()
 
 
@@ -188,11 +203,13 @@ class Processes(ThreadPoolExecutor):
         super().__init__(workers)
         self._own, self._pools, self._starting = threading.local(), list[Pool](), threading.Lock()
         self._ended = False
-        for _ in range(workers):  # all of them load what is slow to load, while the first jobs are thought of
+        # all of them load what is slow to load, while the first jobs are thought of
+        for _ in range(workers):
             self.submit(_load)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """See :class:`concurrent.futures.Executor`; ``BrokenProcessPool`` is the death of this job's process alone."""
+        """See :class:`concurrent.futures.Executor`; ``BrokenProcessPool`` is the death of this
+        job's process alone."""
         return super().submit(self._in_process, fn, *args, **kwargs)
 
     def _in_process(self, fn: Callable[..., Any], *args: Any) -> Any:
@@ -207,7 +224,8 @@ class Processes(ThreadPoolExecutor):
             self._own.pool = pool
             self._pools.append(pool)
         try:
-            with self._starting, _without_current_folder():  # a process starts when it is first given something
+            # a process starts when it is first given something
+            with self._starting, _without_current_folder():
                 if self._ended:
                     raise BrokenExecutor("ended")
                 job = pool.submit(fn, *args)
@@ -223,11 +241,16 @@ class Processes(ThreadPoolExecutor):
         self.shutdown(cancel_futures=kind is not None)
 
     def end(self) -> None:
-        """End the processes now: each is told, and has a few seconds to take back what it is writing."""
+        """End the processes now: each is told, and has a few seconds to take back what it is
+        writing."""
         with self._starting:
             self._ended = True
         super().shutdown(wait=False, cancel_futures=True)
-        children = [p for pool in self._pools for p in list((getattr(pool, "_processes", None) or {}).values())]
+        children = [
+            p
+            for pool in self._pools
+            for p in list((getattr(pool, "_processes", None) or {}).values())
+        ]
         for child in children:
             child.terminate()
         until = time.monotonic() + _LAST_S
@@ -245,14 +268,17 @@ class Processes(ThreadPoolExecutor):
 
 def _load() -> None:
     importlib.import_module("recon.evaluate.experiment")
-    source_digest()  # of all files as they are loaded: what is installed while a worker runs, it does not have
+    # of all files as they are loaded: what is installed while a worker runs, it does not have
+    source_digest()
 
 
 @contextlib.contextmanager
 def _without_current_folder() -> Iterator[None]:
-    """A process that is started meanwhile imports nothing from the current folder but what this process would.
+    """A process that is started meanwhile imports nothing from the current folder but what this
+    process would.
 
-    Python looks there first for the modules that it needs to start (https://docs.python.org/3/using/cmdline.html).
+    Python looks there first for the modules that it needs to start
+    (https://docs.python.org/3/using/cmdline.html).
     """
     before = os.environ.get(_SAFE_PATH)
     os.environ[_SAFE_PATH] = "1"
@@ -281,7 +307,8 @@ def _begin_process(safe_path: str | None) -> None:
     """First thing in a process of :class:`Processes`.
 
     Args:
-        safe_path: what Python's variable of this name was before it was started; its own programs find that again.
+        safe_path: what Python's variable of this name was before it was started; its own programs
+            find that again.
     """
     _set_safe_path(safe_path)
 
@@ -323,7 +350,9 @@ class Cluster(Executor):
             raise ImportError("--scheduler needs Dask: pip install 'torchpcct[cluster]'") from error
         is_file = scheduler.endswith(".json") or Path(scheduler).is_file()
         if is_file and not Path(scheduler).is_file():
-            raise FileNotFoundError(f"{scheduler} does not exist: dask scheduler --scheduler-file writes it")
+            raise FileNotFoundError(
+                f"{scheduler} does not exist: dask scheduler --scheduler-file writes it"
+            )
         given = {"scheduler_file": scheduler} if is_file else {"address": scheduler}
         quiet = logging.getLogger("distributed")
         level, self.address, self.threads = quiet.level, scheduler, whole("threads", threads or 1)
@@ -331,7 +360,9 @@ class Cluster(Executor):
         try:
             self.client = Client(**given, timeout=_ANSWER_S, set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
-            raise ConnectionError(f"no Dask scheduler answers at {scheduler} within {_ANSWER_S:g} s") from error
+            raise ConnectionError(
+                f"no Dask scheduler answers at {scheduler} within {_ANSWER_S:g} s"
+            ) from error
         finally:
             quiet.setLevel(level)
         self.avoid: dict[str, str] = {}  # machine → why
@@ -343,8 +374,11 @@ class Cluster(Executor):
 
         self.dumps = dumps
         for address in self._addresses:
-            first = self.client.submit(_load, workers=[address], allow_other_workers=True, pure=False)
-            fire_and_forget(first)  # not kept: a worker that dies would lose it, and nobody needs it
+            first = self.client.submit(
+                _load, workers=[address], allow_other_workers=True, pure=False
+            )
+            # not kept: a worker that dies would lose it, and nobody needs it
+            fire_and_forget(first)
 
     @property
     def workers(self) -> int:
@@ -368,17 +402,21 @@ class Cluster(Executor):
         # Machines, not workers: one that dies is started again under another address.
         only = {"workers": sorted(set(map(_machine, self._addresses)))} if self.avoid else {}
         kwargs["key"] = f"torchpcct-{secrets.token_hex(16)}"
-        found: Future[Any] = self.client.get_executor(pure=False, **only).submit(fn, *args, **kwargs)
+        found: Future[Any] = self.client.get_executor(pure=False, **only).submit(
+            fn, *args, **kwargs
+        )
         self._given[kwargs["key"]] = found
         return found
 
     def refuse(self, error: Unfit) -> None:
-        """Give no more jobs to the machine of a worker, whose other workers have the same software and disks."""
+        """Give no more jobs to the machine of a worker, whose other workers have the same
+        software and disks."""
         if self.avoid.setdefault(_machine(error.args[0]), str(error)) == str(error):
             log.warning("%s; jobs go to other machines", error)
 
     def check(self) -> None:
-        """Raise ``ConnectionError`` if the scheduler is gone, or was: it has forgotten what it was given.
+        """Raise ``ConnectionError`` if the scheduler is gone, or was: it has forgotten what it was
+        given.
 
         A warning says that there is no worker, and for how long.
         """
@@ -389,7 +427,8 @@ class Cluster(Executor):
         since = now if since is None and not self.workers else since
         if since is not None and now - since >= tell_at:
             log.warning(
-                "no worker since %.0f s: jobs wait until one comes to the scheduler %s (dask worker --nthreads 1); "
+                "no worker since %.0f s: jobs wait until one comes to the scheduler %s (dask "
+                "worker --nthreads 1); "
                 "what is done is kept, Ctrl-C ends",
                 now - since,
                 self.address,
@@ -398,14 +437,19 @@ class Cluster(Executor):
         self._without = since, tell_at
         if self.client.status in ("closing", "closed"):
             raise _gone(self)
-        # What only a dead worker held is lost as well, but the scheduler knows it and has it computed again. A job that
-        # is done while the scheduler answers is forgotten rightly: so only what runs on counts, and that twice.
+        # What only a dead worker held is lost as well, but the scheduler knows it and has it
+        # computed again. A job that is done while the scheduler answers is forgotten rightly: so
+        # only what runs on counts, and that twice.
         self._given = {key: future for key, future in self._given.items() if not future.done()}
         if not self._lost() or now - self._doubted[0] < _AGAIN_S:
             return
         try:
-            unknown = self.client.run_on_scheduler(  # a lambda is sent whole: the scheduler need not have torchpcct
-                lambda keys, dask_scheduler: [key for key in keys if key not in dask_scheduler.tasks], self._lost()
+            # a lambda is sent whole: the scheduler need not have torchpcct
+            unknown = self.client.run_on_scheduler(
+                lambda keys, dask_scheduler: [
+                    key for key in keys if key not in dask_scheduler.tasks
+                ],
+                self._lost(),
             )
         except (OSError, TimeoutError):
             return  # the client's status says so soon
@@ -417,7 +461,11 @@ class Cluster(Executor):
     def _lost(self) -> list[str]:
         """Keys of jobs that are not done, and whose worker or scheduler is gone."""
         states = self.client.futures
-        return [k for k, f in self._given.items() if not f.done() and getattr(states.get(k), "status", "") == "lost"]
+        return [
+            k
+            for k, f in self._given.items()
+            if not f.done() and getattr(states.get(k), "status", "") == "lost"
+        ]
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Part from the scheduler, which goes on; what was submitted and is not done is dropped."""
@@ -430,7 +478,7 @@ def _machine(address: str) -> str:
     return str(get_address_host(address))
 
 
-# --- what a worker does -------------------------------------------------------------------------------------------
+# --- what a worker does ---------------------------------------------------------------------------
 
 
 def _where() -> tuple[str, str | None, int]:
@@ -445,7 +493,8 @@ def _where() -> tuple[str, str | None, int]:
 
 @lru_cache(maxsize=1)  # until another number is asked for
 def _use_threads(threads: int) -> None:
-    """In a worker: torch, BLAS and our own kernels. Dask sets none of the last two, and N workers would fight."""
+    """In a worker: torch, BLAS and our own kernels. Dask sets none of the last two, and N
+    workers would fight."""
     import torch
     from threadpoolctl import threadpool_limits
 
@@ -458,7 +507,8 @@ def _use_threads(threads: int) -> None:
 
 @contextlib.contextmanager
 def _compiling(own: bool) -> Iterator[Callable[[], float]]:
-    """Gives the seconds in which numba has compiled kernels. Of the workers of a machine each compiles others."""
+    """Gives the seconds in which numba has compiled kernels. Of the workers of a machine each
+    compiles others."""
     from numba.core import event
 
     timer = event.TimingListener()
@@ -469,7 +519,8 @@ def _compiling(own: bool) -> Iterator[Callable[[], float]]:
 
 @contextlib.contextmanager
 def heard(*loggers: str, alone: bool = False) -> Iterator[list[str]]:
-    """The warnings that loggers are given meanwhile; ``""`` is the root. ``alone``: nobody else hears them."""
+    """The warnings that loggers are given meanwhile; ``""`` is the root. ``alone``: nobody else
+    hears them."""
     said: list[str] = []
 
     class Listener(logging.Handler):
@@ -506,14 +557,21 @@ def _do_job(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _
     where, scratch, at_once = _where()
     if not own:
         if at_once > 1:
-            raise Unfit(where, f"takes {at_once} jobs at once: start it with --nthreads 1 (more workers of a machine: "
-                        "--nworkers)")  # fmt: skip
+            raise Unfit(
+                where,
+                f"takes {at_once} jobs at once: start it with --nthreads 1 (more workers of a "
+                "machine: "
+                "--nworkers)",
+            )
         if of.path and of.path not in sys.path and os.path.isdir(of.path):
             sys.path.append(of.path)
         source_digest()  # as in _load, for a worker that came later
         if (VERSION, source_digest(module)) != (of.version, digest):
-            raise Unfit(where, f"has another torchpcct (its version {VERSION}, here {of.version}; the sources of "
-                        f"{module} differ): install the same one, and start it again")  # fmt: skip
+            raise Unfit(
+                where,
+                f"has another torchpcct (its version {VERSION}, here {of.version}; the sources of "
+                f"{module} differ): install the same one, and start it again",
+            )
         if of.threads is not None:
             _use_threads(of.threads)
     function, args = pickle.loads(call)
@@ -529,20 +587,27 @@ def _do_job(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _
         if scratch is None or (error.errno not in _DISK and not isinstance(error, WriteError)):
             raise
         raise Unfit(where, f"cannot write: {error}") from error
-    made = {} if shared else {
-        p.relative_to(folder).as_posix(): p.read_bytes() for pattern in makes for p in folder.glob(pattern)
-    }  # fmt: skip
+    made = (
+        {}
+        if shared
+        else {
+            p.relative_to(folder).as_posix(): p.read_bytes()
+            for pattern in makes
+            for p in folder.glob(pattern)
+        }
+    )
     return _Done(where, value, made, time.perf_counter() - start, compiled(), said)
 
 
-# --- the client ---------------------------------------------------------------------------------------------------
+# --- the client -----------------------------------------------------------------------------------
 
 
 def packed_call(executor: Executor | None, value: Any) -> bytes:
     """A value as a job of this executor carries it.
 
     Raises:
-        Unportable: it cannot be pickled (a lambda, a function in a function), or another process would not find it.
+        Unportable: it cannot be pickled (a lambda, a function in a function), or another process
+            would not find it.
     """
     dumps = getattr(executor, "dumps", None)
     try:
@@ -552,9 +617,12 @@ def packed_call(executor: Executor | None, value: Any) -> bytes:
 
 
 def run(
-    jobs: Sequence[Job], folder: Path, executor: Executor, progress: Progress | None = None,
+    jobs: Sequence[Job],
+    folder: Path,
+    executor: Executor,
+    progress: Progress | None = None,
     finished: Callable[[Job], Any] | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Run jobs, as many at once as there are workers.
 
     Args:
@@ -568,9 +636,11 @@ def run(
         Name → what the job's function gave.
 
     Raises:
-        LeftOut: jobs of which three workers died, or for which no worker is left; all others are done.
+        LeftOut: jobs of which three workers died, or for which no worker is left; all others are
+            done.
         Unportable: a job that cannot be pickled.
-        Unfit: a process that has other sources than this one; of a cluster such workers are left aside.
+        Unfit: a process that has other sources than this one; of a cluster such workers are left
+            aside.
         ConnectionError: the scheduler is gone.
         Exception: whatever a job's function raises; those that are done are kept.
     """
@@ -581,9 +651,13 @@ def run(
     folder.mkdir(parents=True, exist_ok=True)
     with marker(folder) as here:
         of = _Run(
-            str(folder.resolve()), str(here.resolve()), (platform.node(), os.getpid()),
-            getattr(executor, "threads", None), VERSION, _current_folder(),
-        )  # fmt: skip
+            str(folder.resolve()),
+            str(here.resolve()),
+            (platform.node(), os.getpid()),
+            getattr(executor, "threads", None),
+            VERSION,
+            _current_folder(),
+        )
         return _run(jobs, folder, executor, of, _Log(executor, jobs), progress, finished)
 
 
@@ -594,9 +668,14 @@ def _current_folder() -> str:
 
 
 def _run(
-    jobs: Sequence[Job], folder: Path, executor: Executor, of: _Run, book: _Log,
-    progress: Progress | None, finished: Callable[[Job], Any] | None,
-) -> dict[str, Any]:  # fmt: skip
+    jobs: Sequence[Job],
+    folder: Path,
+    executor: Executor,
+    of: _Run,
+    book: _Log,
+    progress: Progress | None,
+    finished: Callable[[Job], Any] | None,
+) -> dict[str, Any]:
     names = {job.name for job in jobs}
     needs = {job.name: names.intersection(job.after) for job in jobs}
     next_: dict[str, list[Job]] = defaultdict(list)
@@ -616,7 +695,8 @@ def _run(
     try:
         while ready or running:
             workers, avoid = getattr(executor, "workers", 16), getattr(executor, "avoid", {})
-            # No more than there are workers: what waits on one that dies would count as having killed it.
+            # No more than there are workers: what waits on one that dies would count as having
+            # killed it.
             while ready and len(running) < max(1, workers):
                 job = ready.popleft()
                 if not workers and avoid:
@@ -624,7 +704,9 @@ def _run(
                     continue
                 module = job.module or job.function.__module__
                 call = packed_call(executor, (job.function, job.args))
-                running[executor.submit(_work, call, module, source_digest(module), job.makes, of)] = job
+                running[
+                    executor.submit(_work, call, module, source_digest(module), job.makes, of)
+                ] = job
             for future in wait_for(running, 1.0, FIRST_COMPLETED)[0] if running else ():
                 job = running.pop(future)
                 try:
@@ -665,7 +747,10 @@ def _run(
             if progress is not None:
                 progress(book.text(len(values), len(running), len(lost)), len(values) / len(jobs))
     except KeyboardInterrupt as error:
-        book.note(f"ended    {error or 'interrupted'}: {len(values)} of {len(jobs)} jobs are done, and kept")
+        book.note(
+            f"ended    {error or 'interrupted'}: {len(values)} of {len(jobs)} jobs are done, and "
+            "kept"
+        )
         raise
     finally:
         for future in running:
@@ -673,7 +758,8 @@ def _run(
     if lost:
         listed = [f"{name} ({why})" for name, why in lost.items()]
         raise LeftOut(
-            f"{len(lost)} of {len(jobs)} jobs are missing: {'; '.join(listed[:5])}{'; …' if listed[5:] else ''}. The "
+            f"{len(lost)} of {len(jobs)} jobs are missing: "
+            f"{'; '.join(listed[:5])}{'; …' if listed[5:] else ''}. The "
             "others are done and kept: the same command tries these again"
         )
     return values
@@ -701,12 +787,14 @@ def _death(error: Exception, executor: Executor) -> str:
 
 def _gone(executor: Executor) -> ConnectionError:
     return ConnectionError(
-        f"the scheduler {getattr(executor, 'address', '')} is gone: what is done is kept, the same command goes on"
+        f"the scheduler {getattr(executor, 'address', '')} is gone: what is done is kept, the "
+        "same command goes on"
     )
 
 
 class _Log:
-    """What a run says of itself: a line for each job in the executor's log file, and its progress."""
+    """What a run says of itself: a line for each job in the executor's log file, and its
+    progress."""
 
     def __init__(self, executor: Executor, jobs: Sequence[Job]) -> None:
         self.path: Path | None = getattr(executor, "log", None)
@@ -732,9 +820,15 @@ class _Log:
     def text(self, done: int, running: int, failed: int) -> str:
         """Of the progress: the step, and after a bar what changes."""
         left = sum(self.weights.values()) - self.finished
-        seconds = left * (time.perf_counter() - self.start) / self.finished if self.finished else None
+        seconds = (
+            left * (time.perf_counter() - self.start) / self.finished if self.finished else None
+        )
         until = (
-            "" if seconds is None else f", {seconds / 60:.0f} min left" if seconds > 90 else f", {seconds:.0f} s left"
+            ""
+            if seconds is None
+            else f", {seconds / 60:.0f} min left"
+            if seconds > 90
+            else f", {seconds:.0f} s left"
         )
         compiled = f", {self.compiled_s:.0f} s compiling" if self.compiled_s else ""
         return f"jobs|{done} done, {running} running, {failed} failed{until}{compiled}"
@@ -751,7 +845,9 @@ def _table(jobs: Sequence[Job]) -> str:
     rows += [f"{j.seconds:8.1f} {j.mib:6.0f} {j.bytes / 1e3:8.0f}  {j.name}" for j in jobs]
     total = sum(j.seconds for j in jobs)
     rows.append(
-        f"{len(jobs)} jobs, about {total / 3600:.2f} core hours, {max((j.mib for j in jobs), default=0.0):.0f} MiB in "
-        f"a process, {sum(j.bytes for j in jobs) / 1e6:.1f} MB kept (estimates of one core; 0: not known)"
+        f"{len(jobs)} jobs, about {total / 3600:.2f} core hours, "
+        f"{max((j.mib for j in jobs), default=0.0):.0f} MiB in "
+        f"a process, {sum(j.bytes for j in jobs) / 1e6:.1f} MB kept (estimates of one core; 0: "
+        "not known)"
     )
     return "\n".join(rows)

@@ -61,8 +61,8 @@ class Evaluation:
     """Result of :func:`evaluate`.
 
     Attributes:
-        records: one for each figure: task, method, exposure_s, figure, where, value, low, high, unit, n. ``low`` and
-            ``high`` end the 95 % interval; NaN: the value is exact, or a time.
+        records: one for each figure: task, method, exposure_s, figure, where, value, low, high,
+            unit, n. ``low`` and ``high`` end the 95 % interval; NaN: the value is exact, or a time.
         results: of each task.
         settings: of the run.
     """
@@ -88,22 +88,25 @@ def evaluate(
 
     Args:
         tasks: names of ready ones, YAML files, :class:`recon.evaluate.Task` objects; one or a list.
-        methods: names, functions of ``(scan, grid)`` that give a volume in HU, :class:`recon.evaluate.Method` objects,
-            :func:`recon.evaluate.denoiser` of a function of an image; one or a list.
+        methods: names, functions of ``(scan, grid)`` that give a volume in HU,
+            :class:`recon.evaluate.Method` objects, :func:`recon.evaluate.denoiser` of a function of
+            an image; one or a list.
         exposures_s: of the scans in s, one or a list; None: those of each task.
         n: realisations of each, at least 8.
         seed: of the first.
-        folder: where scans and finished pieces are kept; the same call goes on after an interruption, and a second one
-            with more methods or realisations computes what is new. None: nothing is kept.
+        folder: where scans and finished pieces are kept; the same call goes on after an
+            interruption, and a second one with more methods or realisations computes what is new.
+            None: nothing is kept.
         progress: called with a text and the finished fraction of it.
         executor: where volumes are computed, any of :mod:`concurrent.futures`, best one of
-            :mod:`recon.evaluate.execute`; None: that of :func:`recon.evaluate.execute.using`, else here, one after
-            another. The figures are the same, but for times.
+            :mod:`recon.evaluate.execute`; None: that of :func:`recon.evaluate.execute.using`, else
+            here, one after another. The figures are the same, but for times.
 
     Raises:
-        ValueError, TypeError: an unknown task or method, bad values; a method whose volume has another shape or unit,
-            holds NaN or is shifted.
-        recon.evaluate.execute.LeftOut: jobs that failed wherever they were tried; the others are kept.
+        ValueError, TypeError: an unknown task or method, bad values; a method whose volume has
+            another shape or unit, holds NaN or is shifted.
+        recon.evaluate.execute.LeftOut: jobs that failed wherever they were tried; the others are
+            kept.
     """
     n, seed = whole("n", n, LEAST), whole("seed", seed, 0)
     todo = [read_task(t) for t in _listed(tasks)]
@@ -111,27 +114,49 @@ def evaluate(
     for kind, names in (("tasks", [t.name for t in todo]), ("methods", [m.name for m in run])):
         twice = {name for name in names if names.count(name) > 1}
         if twice:
-            raise ValueError(f"{kind}: {', '.join(sorted(twice))} given twice; give one of them another name")
+            raise ValueError(
+                f"{kind}: {', '.join(sorted(twice))} given twice; give one of them another name"
+            )
     exposures = (
-        None if exposures_s is None else tuple(numbers("exposures_s", _listed(exposures_s), positive=True, unit="s"))
+        None
+        if exposures_s is None
+        else tuple(numbers("exposures_s", _listed(exposures_s), positive=True, unit="s"))
     )
     if folder is None:
         with TemporaryDirectory() as kept:
             return evaluate(
-                todo, run, exposures_s=exposures, n=n, seed=seed, folder=kept, progress=progress, executor=executor
+                todo,
+                run,
+                exposures_s=exposures,
+                n=n,
+                seed=seed,
+                folder=kept,
+                progress=progress,
+                executor=executor,
             )
     executor = executor or execute.current()
     if executor is not None:
-        jobs = [job for task in todo for job in _jobs(task, run, exposures, n, seed, Path(folder), executor)]
+        jobs = [
+            job
+            for task in todo
+            for job in _jobs(task, run, exposures, n, seed, Path(folder), executor)
+        ]
         execute.run(jobs, Path(folder), executor, progress)
     records: list[Record] = []
     seen = []
     for task in todo:
-        found, what = _task(task, run, exposures or task.exposures_s, n, seed, Path(folder), progress)
+        found, what = _task(
+            task, run, exposures or task.exposures_s, n, seed, Path(folder), progress
+        )
         records += found
         seen.append(what)
-    settings = {"tasks": [t.name for t in todo], "methods": [m.name for m in run], "n": n, "seed": seed,
-                "exposures_s": exposures}  # fmt: skip
+    settings = {
+        "tasks": [t.name for t in todo],
+        "methods": [m.name for m in run],
+        "n": n,
+        "seed": seed,
+        "exposures_s": exposures,
+    }
     return Evaluation(records, seen, settings)
 
 
@@ -147,20 +172,29 @@ def _everyone(task: Task, methods: Sequence[Method]) -> list[Method]:
     """The methods after the task's reference."""
     reference = method_of(task.reference)
     if not reference.is_fbp:
-        raise ValueError(f"task {task.name}: factors are quoted against FBP, got {reference.name!r}")
+        raise ValueError(
+            f"task {task.name}: factors are quoted against FBP, got {reference.name!r}"
+        )
     return [reference, *(m for m in methods if m.name != reference.name)]
 
 
-# --- the same as jobs ---------------------------------------------------------------------------------------------
+# --- the same as jobs -----------------------------------------------------------------------------
 
 
 def _jobs(
-    task: Task, methods: Sequence[Method], exposures: Sequence[float] | None, n: int, seed: int, folder: Path,
+    task: Task,
+    methods: Sequence[Method],
+    exposures: Sequence[float] | None,
+    n: int,
+    seed: int,
+    folder: Path,
     executor: Executor,
-) -> list[Job]:  # fmt: skip
-    """What :func:`_task` would compute and is not there yet: scans and facts, then every block of realisations.
+) -> list[Job]:
+    """What :func:`_task` would compute and is not there yet: scans and facts, then every block of
+    realisations.
 
-    A job draws its realisations for several methods: for all of them, if there are jobs enough for all workers.
+    A job draws its realisations for several methods: for all of them, if there are jobs enough for
+    all workers.
     """
     everyone, sent = _everyone(task, methods), []
     for method in everyone:
@@ -169,9 +203,12 @@ def _jobs(
             sent.append(method)
         except Unportable as error:
             log.warning(
-                "%s is computed here, not by other processes: it is made of a function that they cannot load (%s); a "
-                "function of a module can be loaded", method.name, error,
-            )  # fmt: skip
+                "%s is computed here, not by other processes: it is made of a function that they "
+                "cannot load (%s); a "
+                "function of a module can be loaded",
+                method.name,
+                error,
+            )
     kernels = tuple(k for m in everyone for k in m.kernels)
     bench = zlib.compress(execute.packed_call(executor, (task, sent, seed, kernels)))
     store, place = Store(folder / task.name), f"{task.name}/"
@@ -181,30 +218,57 @@ def _jobs(
         jobs += [Job(name, _do, (bench, "scan", signal)) for name, signal in scans.items()]
         jobs.append(Job(first, _do, (bench, "facts"), (f"{place}facts.npz",), tuple(scans)))
     wanted = list(dict.fromkeys(m.kernels[0] for m in sent if m.is_fbp))
-    exact = [kernel for kernel in wanted if not store.has(f"exact_{kernel}", f"1 {task.fingerprint}")]
+    exact = [
+        kernel for kernel in wanted if not store.has(f"exact_{kernel}", f"1 {task.fingerprint}")
+    ]
     if exact:
-        name, made = f"{task.name}: exact noise, {', '.join(exact)}", tuple(f"{place}exact_{k}.npz" for k in exact)
+        name, made = (
+            f"{task.name}: exact noise, {', '.join(exact)}",
+            tuple(f"{place}exact_{k}.npz" for k in exact),
+        )
         jobs.append(Job(name, _do, (bench, "exact", exact), made, tuple(scans)))
     blocks = [range(start, min(start + BLOCK, n)) for start in range(0, n, BLOCK)]
     exposures = exposures or task.exposures_s
-    groups = min(len(sent), -(-2 * getattr(executor, "workers", 16) // (len(blocks) * len(exposures)))) or 1
+    groups = (
+        min(len(sent), -(-2 * getattr(executor, "workers", 16) // (len(blocks) * len(exposures))))
+        or 1
+    )
     for exposure in exposures:
         for group in (sent[g::groups] for g in range(groups)):
             kept = {m.name: kept_as(m, exposure, task, seed) for m in group}
             known = f"{task.name}: {exposure:g} s, noise-free, {', '.join(kept)}"
             for k in (range(0), *blocks):
-                asked = [m.name for m in group if not all(
-                    store.has(f"{kept[m.name][0]}/{part}", kept[m.name][1]) for part in _parts(m, k)
-                )]  # fmt: skip
+                asked = [
+                    m.name
+                    for m in group
+                    if not all(
+                        store.has(f"{kept[m.name][0]}/{part}", kept[m.name][1])
+                        for part in _parts(m, k)
+                    )
+                ]
                 if not asked:
                     continue
-                pieces = (f"{place}{kept[m.name][0]}/{part}.npz" for m in group for part in _parts(m, k))
-                name = f"{task.name}: {exposure:g} s, {k.start}-{k.stop}, {', '.join(asked)}" if k else known
+                pieces = (
+                    f"{place}{kept[m.name][0]}/{part}.npz" for m in group for part in _parts(m, k)
+                )
+                name = (
+                    f"{task.name}: {exposure:g} s, {k.start}-{k.stop}, {', '.join(asked)}"
+                    if k
+                    else known
+                )
                 seconds, kb = _estimate(task, [m for m in group if m.name in asked], max(len(k), 1))
                 jobs.append(
-                    Job(name, _do, (bench, "block", exposure, asked, k), (*pieces, f"{place}sigma_*.npz"),
-                        (first, known) if k else (first,), seconds=seconds, mib=_MIB, bytes=kb)
-                )  # fmt: skip
+                    Job(
+                        name,
+                        _do,
+                        (bench, "block", exposure, asked, k),
+                        (*pieces, f"{place}sigma_*.npz"),
+                        (first, known) if k else (first,),
+                        seconds=seconds,
+                        mib=_MIB,
+                        bytes=kb,
+                    )
+                )
     return jobs
 
 
@@ -216,22 +280,29 @@ def _parts(method: Method, k: range) -> tuple[str, ...]:
 
 
 _SECONDS = {"fbp": 0.0, "pwls": 0.5, "mbir": 0.8}
-"""Of a volume of 10⁵ voxels on one core by method; _OTHER_S of a filter or another function, _DRAW_S of a noisy scan
-and its twin with FBP of them (1968 views), _MIB of a process."""
-_OTHER_S, _DRAW_S, _MIB = 0.2, 2.0, 2600.0
+"""Of a volume of 10⁵ voxels on one core by method; _OTHER_S of a filter or another function,
+_DRAW_S of a noisy scan and its twin with FBP of them (1968 views), _MIB of a process."""
+_OTHER_S = 0.2
+_DRAW_S = 2.0
+_MIB = 2600.0
 
 
 def _estimate(task: Task, methods: Sequence[Method], n: int) -> tuple[float, float]:
     """Rough seconds of realisations on one core, and bytes that are kept."""
     volumes = 2 * n * task.grid.voxels / 1e5
     seconds = volumes * sum(_SECONDS.get(m.name.partition(":")[0], _OTHER_S) for m in methods)
-    return seconds + n * _DRAW_S, len(methods) * (2.0 * task.grid.voxels + 8e3 * n * (3 + len(task.names)))
+    return seconds + n * _DRAW_S, len(methods) * (
+        2.0 * task.grid.voxels + 8e3 * n * (3 + len(task.names))
+    )
 
 
 class _Bench:
-    """What a process needs of a task: its draws, what reads their volumes, and the methods; then the jobs."""
+    """What a process needs of a task: its draws, what reads their volumes, and the methods; then
+    the jobs."""
 
-    def __init__(self, folder: Path, task: Task, methods: Sequence[Method], seed: int, kernels: Sequence[str]) -> None:
+    def __init__(
+        self, folder: Path, task: Task, methods: Sequence[Method], seed: int, kernels: Sequence[str]
+    ) -> None:
         self.draws = Draws(task, Store(folder / task.name), seed, kernels)
         self.methods = {m.name: m for m in methods}
 
@@ -250,7 +321,8 @@ class _Bench:
         self.draws.exact_covariances(kernels)
 
     def block(self, exposure: float, names: Sequence[str], k: range) -> None:
-        """Pieces of methods at an exposure: of a block of realisations, or of none what is without noise."""
+        """Pieces of methods at an exposure: of a block of realisations, or of none what is
+        without noise."""
         pairs = cache(partial(_pairs, self.draws, exposure, k))
         for name in names:
             measurement = Measurement(self.methods[name], self.draws, self.reader, exposure)
@@ -267,13 +339,18 @@ def _do(folder: Path, packed: bytes, job: str, *given: Any) -> None:
     getattr(_bench(folder, packed), job)(*given)
 
 
-# --- the loop -----------------------------------------------------------------------------------------------------
+# --- the loop -------------------------------------------------------------------------------------
 
 
 def _task(
-    task: Task, methods: Sequence[Method], exposures: Sequence[float], n: int, seed: int, folder: Path,
+    task: Task,
+    methods: Sequence[Method],
+    exposures: Sequence[float],
+    n: int,
+    seed: int,
+    folder: Path,
     progress: Progress | None,
-) -> tuple[list[Record], TaskResult]:  # fmt: skip
+) -> tuple[list[Record], TaskResult]:
     everyone = _everyone(task, methods)
     reference = everyone[0]
     bench = _Bench(folder, task, everyone, seed, [k for m in everyone for k in m.kernels])
@@ -286,7 +363,9 @@ def _task(
     )
     records: list[Record] = []
     volumes = {}
-    at_1_s = draws.exact_covariances(list(dict.fromkeys(m.kernels[0] for m in everyone if m.is_fbp)))
+    at_1_s = draws.exact_covariances(
+        list(dict.fromkeys(m.kernels[0] for m in everyone if m.is_fbp))
+    )
     for exposure in exposures:
         running = [Measurement(method, draws, reader, exposure) for method in everyone]
         for start in range(0, n, BLOCK):
@@ -305,16 +384,33 @@ def _task(
             exact = at_1_s[method.kernels[0]] / exposure if method.is_fbp else None
             volumes[method.name, exposure] = (own.first, own.first_clean)
             records += records_of(
-                task.name, method.name, exposure, own, base, control, facts, true, absent, reader.rois, exact
+                task.name,
+                method.name,
+                exposure,
+                own,
+                base,
+                control,
+                facts,
+                true,
+                absent,
+                reader.rois,
+                exact,
             )
     true_hu = dict(zip(reader.rois, true.tolist(), strict=True))
     return records, TaskResult(task, facts, true_hu, truth[0].numpy(), volumes)
 
 
 def measured_before(
-    report: Path, tasks: Sequence[Any], folder: Path, *, exposures_s: Any = None, n: int = 20, seed: int = 0
+    report: Path,
+    tasks: Sequence[Any],
+    folder: Path,
+    *,
+    exposures_s: Any = None,
+    n: int = 20,
+    seed: int = 0,
 ) -> list[str]:
-    """Methods of an earlier report that belong on the page of another call of :func:`evaluate` in the same folder.
+    """Methods of an earlier report that belong on the page of another call of :func:`evaluate` in
+    the same folder.
 
     Args:
         report: JSON of :func:`recon.evaluate.report.save`; there need be none.
@@ -322,13 +418,19 @@ def measured_before(
         folder: of the pieces.
 
     Returns:
-        Names of the methods that were measured at these tasks, exposures and realisations, and whose pieces are all
+        Names of the methods that were measured at these tasks, exposures and realisations, and
+        whose pieces are all
         there: they cost nothing. Of others the log says why they are left out.
     """
     try:
         settings = json.loads(report.read_text(encoding="utf-8"))["settings"]
         given, before = (
-            (sorted(names), None if exposures is None else [float(e) for e in _listed(exposures)], runs, first)
+            (
+                sorted(names),
+                None if exposures is None else [float(e) for e in _listed(exposures)],
+                runs,
+                first,
+            )
             for names, exposures, runs, first in (
                 ([read_task(t).name for t in tasks], exposures_s, n, seed),
                 (settings["tasks"], settings["exposures_s"], settings["n"], settings["seed"]),
@@ -338,23 +440,34 @@ def measured_before(
     except (OSError, ValueError, KeyError, TypeError):
         return []
     if given != before:
-        log.warning("%s was measured at other tasks, exposures or realisations: its methods leave the page", report)
+        log.warning(
+            "%s was measured at other tasks, exposures or realisations: its methods leave the page",
+            report,
+        )
         return []
     kept = []
     for name in names:
         try:
             method = method_of(name)
-            there = all(_finished(read_task(t), method, exposures_s, n, seed, folder) for t in tasks)
+            there = all(
+                _finished(read_task(t), method, exposures_s, n, seed, folder) for t in tasks
+            )
         except (ValueError, TypeError, OSError, ImportError, AttributeError):
             there = False
         if there:
             kept.append(name)
         else:
-            log.warning("%s leaves the page of %s: it, or what computes it, has changed; give it again", name, report)
+            log.warning(
+                "%s leaves the page of %s: it, or what computes it, has changed; give it again",
+                name,
+                report,
+            )
     return kept
 
 
-def _finished(task: Task, method: Method, exposures_s: Any, n: int, seed: int, folder: Path) -> bool:
+def _finished(
+    task: Task, method: Method, exposures_s: Any, n: int, seed: int, folder: Path
+) -> bool:
     """Whether all pieces of a method are there."""
     store = Store(folder / task.name)
     blocks = [range(0), *(range(start, min(start + BLOCK, n)) for start in range(0, n, BLOCK))]
@@ -367,15 +480,22 @@ def _finished(task: Task, method: Method, exposures_s: Any, n: int, seed: int, f
 
 @checked
 def export_scans(
-    tasks: Any, folder: str | Path, *, exposures_s: Any = None, n: int = 20, seed: int = 0,
+    tasks: Any,
+    folder: str | Path,
+    *,
+    exposures_s: Any = None,
+    n: int = 20,
+    seed: int = 0,
     progress: Progress | None = None,
-) -> list[Path]:  # fmt: skip
-    """Write the scans that :func:`evaluate` with the same arguments draws, for a program that cannot be called.
+) -> list[Path]:
+    """Write the scans that :func:`evaluate` with the same arguments draws, for a program that
+    cannot be called.
 
-    ``FOLDER/TASK/EXPOSUREs_NUMBER_present.h5`` and ``…_absent.h5``, noise free with ``clean`` for the number, and
-    ``grid.json`` with the inset's shape, spacing and centre ``(z, y, x)`` mm. Save the volumes in HU under the scans'
-    names (``.nii.gz``, ``.mha``, ``.h5``, ``.zarr`` or DICOM folders) in ``OTHER/TASK``, and evaluate the method
-    ``files:OTHER``. ``torchpcct reconstruct FOLDER/TASK/*.h5 --out OTHER/TASK`` does so; its ``_METHOD`` may stay.
+    ``FOLDER/TASK/EXPOSUREs_NUMBER_present.h5`` and ``…_absent.h5``, noise free with ``clean`` for
+    the number, and ``grid.json`` with the inset's shape, spacing and centre ``(z, y, x)`` mm. Save
+    the volumes in HU under the scans' names (``.nii.gz``, ``.mha``, ``.h5``, ``.zarr`` or DICOM
+    folders) in ``OTHER/TASK``, and evaluate the method ``files:OTHER``. ``torchpcct reconstruct
+    FOLDER/TASK/*.h5 --out OTHER/TASK`` does so; its ``_METHOD`` may stay.
 
     Returns:
         The files of the scans.
@@ -384,7 +504,11 @@ def export_scans(
         ValueError, TypeError: as of :func:`evaluate`.
     """
     n, seed = whole("n", n, LEAST), whole("seed", seed, 0)
-    exposures = None if exposures_s is None else numbers("exposures_s", _listed(exposures_s), positive=True, unit="s")
+    exposures = (
+        None
+        if exposures_s is None
+        else numbers("exposures_s", _listed(exposures_s), positive=True, unit="s")
+    )
     written = []
     for task in map(read_task, _listed(tasks)):
         with TemporaryDirectory() as kept:

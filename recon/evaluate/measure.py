@@ -1,7 +1,7 @@
 """What is read of the volumes: every method at every exposure, in pieces that are kept.
 
-A piece is a block of realisations of one method at one exposure. It keeps numbers only: ROI means, channels of the
-observer, errors, and some flat voxels.
+A piece is a block of realisations of one method at one exposure. It keeps numbers only: ROI means,
+channels of the observer, errors, and some flat voxels.
 """
 
 from __future__ import annotations
@@ -34,23 +34,29 @@ Floats = NDArray[np.float64]
 BLOCK = 8
 """Realisations of a piece."""
 OBSERVERS = ("axial", "volume")
-_CHANNELS, _LOWEST = 4, 0.15
-"""Difference-of-Gaussians channels of an observer beside the signal's own shape; frequency of the first, lp/mm."""
+_CHANNELS = 4
+_LOWEST = 0.15
+"""Difference-of-Gaussians channels of an observer beside the signal's own shape; frequency of
+the first, lp/mm."""
 _SEEN_MM = 0.3
 """Standard deviation of the blur through which the observer expects the signal."""
 _LONGEST = 120
 """Bytes of a folder's name that is a method's."""
 _SHIFT_VOXELS = 0.5
 """A volume that lies so much off is on another grid."""
-_SMOOTHED_MM, _SOME_VOXELS = 0.3, 4000
-"""Invented contrast is looked for in errors smoothed by a Gaussian of this standard deviation, in so many voxels."""
-_BORDER_HU, _FEWEST = 50.0, 50
+_SMOOTHED_MM = 0.3
+_SOME_VOXELS = 4000
+"""Invented contrast is looked for in errors smoothed by a Gaussian of this standard deviation,
+in so many voxels."""
+_BORDER_HU = 50.0
+_FEWEST = 50
 """A border that a reader would take for a wall; no shell of fewer voxels."""
 
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Of one method at one exposure; the first axis is the realisation, the second says with or without the signal.
+    """Of one method at one exposure; the first axis is the realisation, the second says with or
+    without the signal.
 
     Attributes:
         rois: ``(n, 2, rois, 2)`` means of signal and background, HU.
@@ -60,14 +66,15 @@ class Readings:
         invented: ``(n, voxels)`` smoothed error with the signal where nothing is, HU.
         shells: ``(n, shells)`` mean error with the signal around the bodies, from near to far, HU.
         flat: tissue → ``(n, voxels)`` HU, with the signal.
-        clean_rois: ``(2, rois, 2)`` of noise-free data; clean_square: likewise; clean_rim: least error
-            there in the rim of the largest tissue, HU.
-        control: ``(n, 2, rois, 2)`` HU: linear functionals of the same draws that follow ``rois``, with their mean
-            ``(2, rois, 2)`` and covariance ``(rois, 2, rois, 2)``; None: the reference's ROI means serve.
+        clean_rois: ``(2, rois, 2)`` of noise-free data; clean_square: likewise; clean_rim: least
+            error there in the rim of the largest tissue, HU.
+        control: ``(n, 2, rois, 2)`` HU: linear functionals of the same draws that follow ``rois``,
+            with their mean ``(2, rois, 2)`` and covariance ``(rois, 2, rois, 2)``; None: the
+            reference's ROI means serve.
         first: first volume with the signal, float16, and that of noise-free data.
         seconds: of a volume.
-        drawn, warned: shares of volumes with and without the signal in which MBIR drew a vessel, or warned of
-            something; NaN: the method does not say.
+        drawn, warned: shares of volumes with and without the signal in which MBIR drew a vessel, or
+            warned of something; NaN: the method does not say.
     """
 
     rois: Floats
@@ -108,7 +115,8 @@ class Reader:
 
     @cached_property
     def channels(self) -> dict[str, Tensor]:
-        """Observer → ``(channels, z, y, x)``: the signal as it is expected, then differences of Gaussians about it."""
+        """Observer → ``(channels, z, y, x)``: the signal as it is expected, then differences of
+        Gaussians about it."""
         task, grid = self.task, self.task.grid
         expected = ndimage.gaussian_filter(
             (self.truth[0] - self.truth[1]).double().numpy(), [_SEEN_MM / s for s in grid.spacing]
@@ -117,8 +125,12 @@ class Reader:
         fullest = int(task.shares["signal"].sum((1, 2)).argmax())
         one = np.zeros((grid.shape[0], 1, 1))
         one[fullest] = 1.0
-        plane = VolumeGrid((1, *grid.shape[1:]), grid.spacing, (float(grid.axes[0][fullest]), *grid.center[1:]))
-        flat = dog_channels(plane.slice, task.middle_mm[1:], _CHANNELS, lowest=_LOWEST)[:, None] * one
+        plane = VolumeGrid(
+            (1, *grid.shape[1:]), grid.spacing, (float(grid.axes[0][fullest]), *grid.center[1:])
+        )
+        flat = (
+            dog_channels(plane.slice, task.middle_mm[1:], _CHANNELS, lowest=_LOWEST)[:, None] * one
+        )
         return {
             "axial": torch.from_numpy(np.concatenate([template_channel(expected * one), flat])),
             "volume": torch.from_numpy(np.concatenate([template_channel(expected), dogs])),
@@ -131,7 +143,9 @@ class Reader:
 
     def responses(self, volume: Tensor, observer: str) -> Floats:
         """Of an observer's channels."""
-        return np.asarray(torch.einsum("zyx,czyx->c", volume.double(), self.channels[observer]).numpy())
+        return np.asarray(
+            torch.einsum("zyx,czyx->c", volume.double(), self.channels[observer]).numpy()
+        )
 
     def square(self, volume: Tensor, mask: Tensor) -> float:
         """Mean square error with the signal in a mask, HU²."""
@@ -139,7 +153,10 @@ class Reader:
 
     def invented(self, volume: Tensor) -> NDArray[np.float32]:
         """Error in some voxels of where nothing is, smoothed within that."""
-        mask, sigmas = self.task.quiet.double().numpy(), [_SMOOTHED_MM / s for s in self.task.grid.spacing]
+        mask, sigmas = (
+            self.task.quiet.double().numpy(),
+            [_SMOOTHED_MM / s for s in self.task.grid.spacing],
+        )
         error = ndimage.gaussian_filter((volume - self.truth[0]).double().numpy() * mask, sigmas)
         at, weights = self._quiet
         return np.asarray(error.reshape(-1)[at] / weights, np.float32)
@@ -167,7 +184,9 @@ class Reader:
         for truth in self.truth:
             hu = truth.numpy()
             borders |= (
-                ndimage.maximum_filter(hu, footprint=ball) - ndimage.minimum_filter(hu, footprint=ball) > _BORDER_HU
+                ndimage.maximum_filter(hu, footprint=ball)
+                - ndimage.minimum_filter(hu, footprint=ball)
+                > _BORDER_HU
             )
         free = torch.from_numpy(~borders)
         return [kept for shell in self.task.shells if int((kept := shell & free).sum()) >= _FEWEST]
@@ -186,7 +205,8 @@ def volume_of(method: Method, draw: Draw) -> Tensor:
     """A method's volume, checked: HU ``(z, y, x)`` float32.
 
     Raises:
-        TypeError, ValueError: what it gave is no volume on the task's grid in HU: another type, shape or grid, NaN.
+        TypeError, ValueError: what it gave is no volume on the task's grid in HU: another type,
+            shape or grid, NaN.
     """
     given = method.run(draw)
     if isinstance(given, Volume):
@@ -199,9 +219,14 @@ def volume_of(method: Method, draw: Draw) -> Tensor:
         given = torch.from_numpy(np.ascontiguousarray(given))
     if not isinstance(given, Tensor) or given.is_complex() or given.dtype == torch.bool:
         kind = given.dtype if isinstance(given, Tensor) else type(given).__name__
-        raise TypeError(f"{method.name} gave {kind}: a real tensor, array or Volume (z, y, x) in HU is needed")
+        raise TypeError(
+            f"{method.name} gave {kind}: a real tensor, array or Volume (z, y, x) in HU is needed"
+        )
     if tuple(given.shape) != draw.grid.shape:
-        raise ValueError(f"{method.name} gave a volume of shape {tuple(given.shape)}, the inset has {draw.grid.shape}")
+        raise ValueError(
+            f"{method.name} gave a volume of shape {tuple(given.shape)}, the inset has "
+            f"{draw.grid.shape}"
+        )
     bad = int((~torch.isfinite(given)).sum())
     if bad:
         raise ValueError(f"{method.name} gave {bad} voxels that are NaN or infinite")
@@ -209,7 +234,8 @@ def volume_of(method: Method, draw: Draw) -> Tensor:
 
 
 def check_volume(volume: Tensor, method: Method, reader: Reader, fbp: Tensor) -> None:
-    """A first look at a noise-free volume with the signal, and FBP of the same scan, HU ``(z, y, x)``: unit and place.
+    """A first look at a noise-free volume with the signal, and FBP of the same scan, HU ``(z, y,
+    x)``: unit and place.
 
     Raises:
         ValueError: not in HU, or shifted.
@@ -219,7 +245,8 @@ def check_volume(volume: Tensor, method: Method, reader: Reader, fbp: Tensor) ->
     scale = float((a * b).sum() / a.square().sum().clamp_min(1e-9))
     if not 0.2 < scale < 5.0 or float((volume - truth).mean().abs()) > 300.0:
         raise ValueError(
-            f"{method.name}: its noise-free volume is {scale:.3g} times the truth, mean {float(volume.mean()):.4g} for "
+            f"{method.name}: its noise-free volume is {scale:.3g} times the truth, mean "
+            f"{float(volume.mean()):.4g} for "
             f"{float(truth.mean()):.4g} HU: does it give HU (water 0, air -1000)?"
         )
     # Its place by FBP: with few views streaks are larger than edges.
@@ -229,7 +256,8 @@ def check_volume(volume: Tensor, method: Method, reader: Reader, fbp: Tensor) ->
     off = [int(k) if k <= n // 2 else int(k) - n for k, n in zip(at, a.shape, strict=True)]
     if any(abs(k) > _SHIFT_VOXELS for k in off):
         raise ValueError(
-            f"{method.name}: its noise-free volume is shifted by {off} voxels (z, y, x): voxel centres lie at "
+            f"{method.name}: its noise-free volume is shifted by {off} voxels (z, y, x): voxel "
+            "centres lie at "
             "grid.axes, ascending"
         )
 
@@ -243,7 +271,8 @@ def kept_as(method: Method, exposure_s: float, task: Task, seed: int) -> tuple[s
 
 
 class Measurement:
-    """A method at one exposure: what is read of noise-free data, then of block after block of realisations.
+    """A method at one exposure: what is read of noise-free data, then of block after block of
+    realisations.
 
     Args:
         method: what reconstructs.
@@ -272,17 +301,25 @@ class Measurement:
         """Realisations ``k``; ``pairs`` gives them, if they have not been measured before."""
 
         def compute() -> dict[str, Any]:
-            return _of(pairs(), self.method, self.reader, keep=k.start == 0, adjoints=self._adjoints)
+            return _of(
+                pairs(), self.method, self.reader, keep=k.start == 0, adjoints=self._adjoints
+            )
 
-        self._pieces.append(self.store.piece(f"{self._place}/{k.start}-{k.stop}", self._key, compute))
+        self._pieces.append(
+            self.store.piece(f"{self._place}/{k.start}-{k.stop}", self._key, compute)
+        )
 
     def readings(self) -> Readings:
         """Of all blocks."""
         pieces, clean, known = self._pieces, self._clean, self._known
         joined = {
-            name: np.concatenate([p[name] for p in pieces]) for name in pieces[0] if name not in ("first", "seconds")
+            name: np.concatenate([p[name] for p in pieces])
+            for name in pieces[0]
+            if name not in ("first", "seconds")
         }
-        known_moments = None if known is None else (joined["control"], known["mean"], known["covariance"])
+        known_moments = (
+            None if known is None else (joined["control"], known["mean"], known["covariance"])
+        )
         return Readings(
             rois=joined["rois"],
             channels={o: joined[f"channels_{o}"] for o in OBSERVERS},
@@ -304,12 +341,27 @@ class Measurement:
 
 
 def _of(
-    pairs: Sequence[Sequence[Any]], method: Method, reader: Reader, keep: bool, adjoints: Tensor | None = None,
+    pairs: Sequence[Sequence[Any]],
+    method: Method,
+    reader: Reader,
+    keep: bool,
+    adjoints: Tensor | None = None,
     fbp: Tensor | None = None,
-) -> dict[str, Any]:  # fmt: skip
-    """A piece of pairs; with ``fbp``, which then is that of the first draw, the first volume is checked against it."""
+) -> dict[str, Any]:
+    """A piece of pairs; with ``fbp``, which then is that of the first draw, the first volume is
+    checked against it."""
     lists: dict[str, list[Any]] = {
-        name: [] for name in ("rois", "drawn", "warned", "square", "square_beside", "invented", "shells", "rim")
+        name: []
+        for name in (
+            "rois",
+            "drawn",
+            "warned",
+            "square",
+            "square_beside",
+            "invented",
+            "shells",
+            "rim",
+        )
     }
     seconds, control = [], []
     channels: dict[str, list[Any]] = {o: [] for o in OBSERVERS}
@@ -350,4 +402,6 @@ def _of(
 
 def functionals(adjoints: Tensor, statistic: Tensor) -> Floats:
     """Of AᵀWy ``(z, y, x)``: ``(rois, 2)`` HU, of adjoints ``(2 · rois, z, y, x)``."""
-    return np.asarray(torch.einsum("zyx,rzyx->r", statistic.double(), adjoints).numpy()).reshape(-1, 2)
+    return np.asarray(torch.einsum("zyx,rzyx->r", statistic.double(), adjoints).numpy()).reshape(
+        -1, 2
+    )

@@ -1,20 +1,26 @@
-"""Methods under test: ours by name, anybody's as a Python function, trained weights, or volumes in files.
+"""Methods under test: ours by name, anybody's as a Python function, trained weights, or volumes in
+files.
 
 A method's name says all:
 
-* ``fbp:KERNEL``, ``pwls``, ``mbir``; ``mbir:fidelity=1``, ``mbir:weights=mine.safetensors``, ``mbir:vessel`` around the
-  drawn outlines of a vessel, ``mbir:tissues`` around its tissues; options are separated by commas;
-* ``mbir:prior=PRIOR``: the same data steps with another prior in the network's place (:mod:`recon.mbir.priors`):
-  ``bilateral``, the filter that the network is given, a filter of :mod:`recon.filters` such as ``perona-malik``, or
-  ``package.module:function``, a denoiser as below or a network of a user's own;
+* ``fbp:KERNEL``, ``pwls``, ``mbir``; ``mbir:fidelity=1``, ``mbir:weights=mine.safetensors``,
+  ``mbir:vessel`` around the drawn outlines of a vessel, ``mbir:tissues`` around its tissues;
+  options are separated by commas;
+* ``mbir:prior=PRIOR``: the same data steps with another prior in the network's place
+  (:mod:`recon.mbir.priors`): ``bilateral``, the filter that the network is given, a filter of
+  :mod:`recon.filters` such as ``perona-malik``, or ``package.module:function``, a denoiser as below
+  or a network of a user's own;
 * ``mbir:weights=FILE,network=package.module:Class``: weights of a network of a user's own;
 * ``FILTER@BASE``: a filter of :mod:`recon.filters` after a linear method, ``bilateral@fbp:detail``;
-* ``package.module:function``: a function of ``(scan, grid)`` that gives a volume in HU; with ``@BASE`` a denoiser, a
-  function of ``(volume)`` or ``(volume, sigma)`` in HU, tensors ``(z, y, x)`` float32;
-* ``files:FOLDER``: volumes that another program has made of scans that :func:`recon.evaluate.export_scans` wrote, files
-  or DICOM folders in ``FOLDER/TASK`` with the scans' names, as ``torchpcct reconstruct`` gives them, too.
+* ``package.module:function``: a function of ``(scan, grid)`` that gives a volume in HU; with
+  ``@BASE`` a denoiser, a function of ``(volume)`` or ``(volume, sigma)`` in HU, tensors ``(z, y,
+  x)`` float32;
+* ``files:FOLDER``: volumes that another program has made of scans that
+  :func:`recon.evaluate.export_scans` wrote, files or DICOM folders in ``FOLDER/TASK`` with the
+  scans' names, as ``torchpcct reconstruct`` gives them, too.
 
-Whatever it is, it becomes a :class:`Method`, a function of one realisation of a scan (:class:`Draw`).
+Whatever it is, it becomes a :class:`Method`, a function of one realisation of a scan
+(:class:`Draw`).
 """
 
 from __future__ import annotations
@@ -102,12 +108,14 @@ class Method:
     Args:
         name: for tables.
         run: from a :class:`Draw` to HU ``(z, y, x)``.
-        key: what its results depend on beside its name (weights, source), so that kept ones are not mixed up.
+        key: what its results depend on beside its name (weights, source), so that kept ones are not
+            mixed up.
         kernels: of FBP that it asks a draw for.
         is_fbp: its volume is FBP with the first of them: means and variances of its ROIs are exact.
         network: it is this MBIR, whose own response to noise controls what is drawn.
-        made: a function of a module and its arguments that make the same method in another process; None: it is sent
-            as it is, which a ``run`` that is no function of a module does not allow.
+        made: a function of a module and its arguments that make the same method in another process;
+            None: it is sent as it is, which a ``run`` that is no function of a module does not
+            allow.
     """
 
     name: str
@@ -123,7 +131,8 @@ class Method:
 
 
 def method_of(spec: Any) -> Method:
-    """A method from its name, see the module; a :class:`Method` or a function of ``(scan, grid)`` as it is.
+    """A method from its name, see the module; a :class:`Method` or a function of ``(scan, grid)``
+    as it is.
 
     Raises:
         ValueError, TypeError: an unknown name or option, with those that there are.
@@ -136,7 +145,9 @@ def method_of(spec: Any) -> Method:
         return _of_function(getattr(spec, "__name__", "function"), spec)
     if isinstance(spec, str):
         return replace(_named(spec), made=(method_of, (spec,)))
-    raise TypeError(f"a method must be a name or a function of (scan, grid), got {type(spec).__name__}")
+    raise TypeError(
+        f"a method must be a name or a function of (scan, grid), got {type(spec).__name__}"
+    )
 
 
 def names_module(spec: str) -> bool:
@@ -155,11 +166,17 @@ def _named(spec: str) -> Method:
     check_method(spec)
     head, _, base = spec.partition("@")
     if base:
-        return _filtered(head, base, spec) if filter_name(head) in FILTERS else denoiser(loaded(head), base, spec)
+        return (
+            _filtered(head, base, spec)
+            if filter_name(head) in FILTERS
+            else denoiser(loaded(head), base, spec)
+        )
     name, _, rest = spec.partition(":")
     if name == "fbp":
         kernel = rest or "standard"
-        return Method(f"fbp:{kernel}", lambda draw: draw.fbp(kernel), kernels=(kernel,), is_fbp=True)
+        return Method(
+            f"fbp:{kernel}", lambda draw: draw.fbp(kernel), kernels=(kernel,), is_fbp=True
+        )
     if name == "pwls":
         return Method("pwls", lambda draw: draw.pwls())
     if name == "mbir":
@@ -173,9 +190,9 @@ def denoiser(function: Callable[..., Any], base: Any, name: str = "") -> Method:
     """A function of an image after a linear method.
 
     Args:
-        function: of ``(volume)`` or ``(volume, sigma)``: HU ``(z, y, x)`` float32, and the standard deviation of the
-            base's noise in the largest tissue, HU; it gives the same shape. Or a denoiser of deepinv
-            (:func:`recon.filters.denoiser_of`).
+        function: of ``(volume)`` or ``(volume, sigma)``: HU ``(z, y, x)`` float32, and the standard
+            deviation of the base's noise in the largest tissue, HU; it gives the same shape. Or a
+            denoiser of deepinv (:func:`recon.filters.denoiser_of`).
         base: a linear method.
         name: for tables.
 
@@ -230,12 +247,16 @@ def _mbir(spec: str, rest: str) -> Method:
         network = OutlineMbir(network)
     # Others need not be differentiable: what is drawn of them is controlled by the reference.
     differentiable = prior is None or prior is bilateral_prior
-    return Method(spec, lambda draw: draw.mbir(network), key=key, network=network if differentiable else None)
+    return Method(
+        spec, lambda draw: draw.mbir(network), key=key, network=network if differentiable else None
+    )
 
 
 def _of_function(name: str, function: Callable[..., Any]) -> Method:
     made = _of_function, (name, function)
-    return Method(name, lambda draw: function(draw.scan, draw.grid), key=_source_of(function), made=made)
+    return Method(
+        name, lambda draw: function(draw.scan, draw.grid), key=_source_of(function), made=made
+    )
 
 
 def _of_files(spec: str, folder: Path) -> Method:
@@ -245,10 +266,14 @@ def _of_files(spec: str, folder: Path) -> Method:
         there = volume_files(folder / task) or volume_files(folder)
         found = [there[n] for n in wanted if n in there]
         if len(found) > 1:
-            raise ValueError(f"{', '.join(map(str, found))} are volumes of one scan: leave one of them in the folder")
+            raise ValueError(
+                f"{', '.join(map(str, found))} are volumes of one scan: leave one of them in the "
+                "folder"
+            )
         if not found:
             raise FileNotFoundError(
-                f"{folder} holds no volume {draw.label}, by itself or with _fbp, _pwls or _mbir behind: reconstruct "
+                f"{folder} holds no volume {draw.label}, by itself or with _fbp, _pwls or _mbir "
+                "behind: reconstruct "
                 "the exported scan of that name"
             )
         volume = Volume.load(found[0])
@@ -262,9 +287,13 @@ def _of_files(spec: str, folder: Path) -> Method:
 
 
 def _content(folder: Path) -> str:
-    """Of the files in a folder: names, sizes and times, so that volumes that are made again are read again."""
-    seen = [(str(p.relative_to(folder)), p.stat().st_size, p.stat().st_mtime_ns) for p in folder.rglob("*")
-            if p.is_file()]  # fmt: skip
+    """Of the files in a folder: names, sizes and times, so that volumes that are made again are
+    read again."""
+    seen = [
+        (str(p.relative_to(folder)), p.stat().st_size, p.stat().st_mtime_ns)
+        for p in folder.rglob("*")
+        if p.is_file()
+    ]
     return hashlib.sha256(repr(sorted(seen)).encode()).hexdigest()[:16]
 
 
@@ -272,7 +301,8 @@ _VOLUMES = (".nii.gz", ".nii", ".mha", ".mhd", ".h5", ".hdf5", ".zarr")
 
 
 def volume_files(folder: Path) -> dict[str, Path]:
-    """Name without ending → a volume in a folder: files of :meth:`torchpcct.Volume.save`, stores, folders of DICOM.
+    """Name without ending → a volume in a folder: files of :meth:`torchpcct.Volume.save`, stores,
+    folders of DICOM.
 
     What lies beside them (summaries, hidden files) is left out. Names may hold dots.
     """
@@ -286,17 +316,19 @@ def volume_files(folder: Path) -> dict[str, Path]:
 
 
 def same_grid(first: VolumeGrid, second: VolumeGrid) -> bool:
-    """Whether two grids are the same within a thousandth of a voxel: files keep places and lengths in float32."""
+    """Whether two grids are the same within a thousandth of a voxel: files keep places and
+    lengths in float32."""
     if first.shape != second.shape:
         return False
-    pairs = zip(first.spacing, second.spacing, first.center, second.center, first.shape, strict=True)
-    return all(
-        abs(a - b) * n <= 1e-3 * b and abs(c - d) <= 1e-3 * b for a, b, c, d, n in pairs
-    )  # fmt: skip
+    pairs = zip(
+        first.spacing, second.spacing, first.center, second.center, first.shape, strict=True
+    )
+    return all(abs(a - b) * n <= 1e-3 * b and abs(c - d) <= 1e-3 * b for a, b, c, d, n in pairs)
 
 
 def _source_of(function: Callable[..., Any]) -> str:
-    """SHA-256 of a function's source, and of the networks and plain values that it uses from outside."""
+    """SHA-256 of a function's source, and of the networks and plain values that it uses from
+    outside."""
     kind = type(function) if isinstance(function, nn.Module) else function
     try:
         text = inspect.getsource(kind)
@@ -317,7 +349,8 @@ def _source_of(function: Callable[..., Any]) -> str:
 
 
 def noise_of(volume: Tensor, flat: Tensor, smooths: float) -> float:
-    """Standard deviation in HU of noise alone in flat voxels, smoothed as a filter does that looks at smoothed ones."""
+    """Standard deviation in HU of noise alone in flat voxels, smoothed as a filter does that
+    looks at smoothed ones."""
     mask = torch.zeros(volume.numel(), dtype=torch.bool)
     mask[flat] = True
     return flat_noise(volume, mask.reshape(volume.shape), sigma=smooths)

@@ -14,7 +14,9 @@ from torchpcct.validate import choice
 __all__ = ["TASKS", "check_method", "check_task"]
 
 _FOLDER = resources.files("recon") / "evaluate" / "tasks"
-TASKS: tuple[str, ...] = tuple(sorted(Path(str(p)).stem for p in _FOLDER.iterdir() if str(p).endswith(".yaml")))
+TASKS: tuple[str, ...] = tuple(
+    sorted(Path(str(p)).stem for p in _FOLDER.iterdir() if str(p).endswith(".yaml"))
+)
 """Names of the tasks that come with the package."""
 
 

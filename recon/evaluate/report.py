@@ -1,7 +1,8 @@
-"""The report of an evaluation: tables, all records as CSV and JSON, pictures, and the whole as one HTML file.
+"""The report of an evaluation: tables, all records as CSV and JSON, pictures, and the whole as one
+HTML file.
 
-Its text is a template in Jinja's language (``templates/evaluation.md.j2``). :func:`filled` and :func:`write_report`
-serve the reports of :mod:`recon.study`, too.
+Its text is a template in Jinja's language (``templates/evaluation.md.j2``). :func:`filled` and
+:func:`write_report` serve the reports of :mod:`recon.study`, too.
 """
 
 from __future__ import annotations
@@ -24,17 +25,30 @@ from recon.evaluate.experiment import Evaluation, TaskResult
 from torchpcct.files import atomic_write
 from torchpcct.viz import base64_text
 
-__all__ = ["filled", "measured_text", "page", "plain", "save", "save_measured", "task_sections", "templates", "text_of",
-           "write_report"]  # fmt: skip
+__all__ = [
+    "filled",
+    "measured_text",
+    "page",
+    "plain",
+    "save",
+    "save_measured",
+    "task_sections",
+    "templates",
+    "text_of",
+    "write_report",
+]
 
 COLUMNS = ("task", "method", "exposure_s", "figure", "where", "value", "low", "high", "unit", "n")
 _WINDOW_HU = (-160.0, 240.0)
 _STYLE = (
-    "body{font:15px/1.5 system-ui,sans-serif;color:#222;max-width:75rem;margin:2rem auto;padding:0 1rem}"
+    "body{font:15px/1.5 system-ui,sans-serif;color:#222;max-width:75rem;margin:2rem "
+    "auto;padding:0 1rem}"
     "td{white-space:nowrap}p{max-width:55rem}"
     "table{border-collapse:collapse;margin:1rem 0;font-size:13px;display:block;overflow-x:auto;"
-    "font-variant-numeric:tabular-nums}td,th{border:1px solid #ccc;padding:.2rem .5rem;text-align:right}"
-    "th{background:#f2f4f6}tr:hover td{background:#f7f9fb}td:first-child,th:first-child{text-align:left}"
+    "font-variant-numeric:tabular-nums}td,th{border:1px solid #ccc;padding:.2rem "
+    ".5rem;text-align:right}"
+    "th{background:#f2f4f6}tr:hover "
+    "td{background:#f7f9fb}td:first-child,th:first-child{text-align:left}"
     "img{max-width:100%}code{background:#f2f4f6;overflow-wrap:anywhere}"
 )
 
@@ -51,16 +65,22 @@ def task_sections(evaluation: Evaluation) -> list[str]:
         task, facts = seen.task, seen.facts
         records = [r for r in evaluation.records if r["task"] == task.name]
         given = {
-            "task": task, "values": dict(zip(facts.tissues, facts.values_hu, strict=True)), "true_hu": seen.true_hu,
-            "found": {tuple(r[k] for k in COLUMNS[1:5]): r for r in records}, "n": evaluation.settings["n"],
-        }  # fmt: skip
+            "task": task,
+            "values": dict(zip(facts.tissues, facts.values_hu, strict=True)),
+            "true_hu": seen.true_hu,
+            "found": {tuple(r[k] for k in COLUMNS[1:5]): r for r in records},
+            "n": evaluation.settings["n"],
+        }
         sections.append(filled(Path(__file__).parent / "templates" / "evaluation.md.j2", given))
     return sections
 
 
 def plain(records: list[Record]) -> list[Record]:
     """JSON values: None for NaN."""
-    return [{k: None if isinstance(v, float) and math.isnan(v) else v for k, v in r.items()} for r in records]
+    return [
+        {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in r.items()}
+        for r in records
+    ]
 
 
 def filled(template: Path, data: Mapping[str, Any]) -> str:
@@ -77,22 +97,31 @@ def filled(template: Path, data: Mapping[str, Any]) -> str:
 def templates(folder: Path) -> Any:
     """The ``jinja2.Environment`` of a folder's templates, where missing values are errors.
 
-    Filters besides Jinja's: ``f(spec)``, a figure or the value of a record by Python's format, a dash where there is
-    none; ``interval(spec)``, a record or ``[value, low, high]`` as ``1.53 [1.47, 1.59]``, the value alone if it is
-    exact; ``rounded``, the same with as many digits as tell something; ``cell``, text for a cell of a table;
-    ``row(key=value, ...)``, the one of a list that has these values; ``record(task, method, exposure_s, figure,
-    where)``, a record of a report. Test: ``finite``.
+    Filters besides Jinja's: ``f(spec)``, a figure or the value of a record by Python's format, a
+    dash where there is none; ``interval(spec)``, a record or ``[value, low, high]`` as ``1.53
+    [1.47, 1.59]``, the value alone if it is exact; ``rounded``, the same with as many digits as
+    tell something; ``cell``, text for a cell of a table; ``row(key=value, ...)``, the one of a list
+    that has these values; ``record(task, method, exposure_s, figure, where)``, a record of a
+    report. Test: ``finite``.
     """
     import jinja2
 
     made = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(folder), undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=jinja2.FileSystemLoader(folder),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
     made.filters |= {
-        "f": _figure, "interval": _interval, "rounded": _rounded, "row": _row,
-        "record": lambda report, *key: _row(report["records"], **dict(zip(COLUMNS, key, strict=False))),
+        "f": _figure,
+        "interval": _interval,
+        "rounded": _rounded,
+        "row": _row,
+        "record": lambda report, *key: _row(
+            report["records"], **dict(zip(COLUMNS, key, strict=False))
+        ),
         "cell": lambda text: str(text).replace("|", "\\|"),
-    }  # fmt: skip
+    }
     made.tests["finite"] = math.isfinite
     return made
 
@@ -103,9 +132,13 @@ def _figure(value: Any, spec: str) -> str:
 
 
 def _interval(value: Any, spec: str = ".2f") -> str:
-    middle, low, high = (value[k] for k in ("value", "low", "high")) if isinstance(value, Mapping) else value
+    middle, low, high = (
+        (value[k] for k in ("value", "low", "high")) if isinstance(value, Mapping) else value
+    )
     text = _figure(middle, spec)
-    return text if low is None or not math.isfinite(low) else f"{text} [{low:{spec}}, {high:{spec}}]"
+    return (
+        text if low is None or not math.isfinite(low) else f"{text} [{low:{spec}}, {high:{spec}}]"
+    )
 
 
 def _rounded(r: Record) -> str:
@@ -122,7 +155,8 @@ def _row(rows: list[Record], **wanted: Any) -> Record:
 
 
 def save(evaluation: Evaluation, folder: str | os.PathLike[str], command: str = "") -> list[Path]:
-    """Write ``report.md``, ``report.json``, ``report.csv``, ``report.html`` and a picture a task; the files written."""
+    """Write ``report.md``, ``report.json``, ``report.csv``, ``report.html`` and a picture a
+    task; the files written."""
     text = text_of(evaluation) + (f"\nCommand: `{command}`.\n" if command else "")
     for seen in evaluation.results:
         name = seen.task.name
@@ -130,8 +164,14 @@ def save(evaluation: Evaluation, folder: str | os.PathLike[str], command: str = 
     table = io.StringIO()
     writer = csv.DictWriter(table, COLUMNS, lineterminator="\n")
     writer.writeheader()
-    writer.writerows([{k: "" if v is None else v for k, v in r.items()} for r in plain(evaluation.records)])
-    data = {"settings": evaluation.settings, "command": command, "records": plain(evaluation.records)}
+    writer.writerows(
+        [{k: "" if v is None else v for k, v in r.items()} for r in plain(evaluation.records)]
+    )
+    data = {
+        "settings": evaluation.settings,
+        "command": command,
+        "records": plain(evaluation.records),
+    }
     pictures = {f"{s.task.name}.png": _picture(s) for s in evaluation.results}
     more = {"report.csv": table.getvalue().encode()}
     return write_report(folder, "Evaluation", text, json.dumps(data, indent=1), pictures, more)
@@ -152,22 +192,37 @@ def measured_text(rows: list[Record], unit: str, reference: str) -> str:
 def save_measured(
     rows: list[Record], unit: str, reference: str, folder: str | os.PathLike[str], command: str = ""
 ) -> list[Path]:
-    """Write ``report.md``, ``.json``, ``.csv`` and ``.html`` of :func:`measured_text`; the files written."""
+    """Write ``report.md``, ``.json``, ``.csv`` and ``.html`` of :func:`measured_text`; the files
+    written."""
     text = measured_text(rows, unit, reference) + (f"\nCommand: `{command}`.\n" if command else "")
-    finite = [{k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in r.items()} for r in rows]
+    finite = [
+        {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in r.items()}
+        for r in rows
+    ]
     data = {"command": command, "unit": unit, "reference": reference, "records": finite}
     table = io.StringIO()
     writer = csv.DictWriter(table, list(rows[0]) if rows else ["method"], lineterminator="\n")
     writer.writeheader()
     writer.writerows([{k: "" if v is None else v for k, v in r.items()} for r in finite])
     title = "Noise at equal resolution"
-    return write_report(folder, title, text, json.dumps(data, indent=1), {}, {"report.csv": table.getvalue().encode()})
+    return write_report(
+        folder,
+        title,
+        text,
+        json.dumps(data, indent=1),
+        {},
+        {"report.csv": table.getvalue().encode()},
+    )
 
 
 def write_report(
-    folder: str | os.PathLike[str], title: str, text: str, values: str, figures: Mapping[str, Any],
+    folder: str | os.PathLike[str],
+    title: str,
+    text: str,
+    values: str,
+    figures: Mapping[str, Any],
     more: Mapping[str, bytes] | None = None,
-) -> list[Path]:  # fmt: skip
+) -> list[Path]:
     """Write a report into ``folder`` (made if need be), each file whole.
 
     Args:
@@ -188,7 +243,12 @@ def write_report(
         buffer = io.BytesIO()
         figure.savefig(buffer, format=Path(name).suffix[1:])
         pictures[name] = buffer.getvalue()
-    contents = {"report.json": f"{values}\n".encode(), "report.md": text.encode(), **(more or {}), **pictures}
+    contents = {
+        "report.json": f"{values}\n".encode(),
+        "report.md": text.encode(),
+        **(more or {}),
+        **pictures,
+    }
     contents["report.html"] = page(title, text, pictures).encode()
     for name, content in contents.items():
         with atomic_write(out / name) as part:
@@ -208,9 +268,14 @@ def _picture(seen: TaskResult) -> Any:
     middle = seen.facts.values_hu[1]
     low, high = _WINDOW_HU if abs(middle) < 400 else (middle - 300.0, middle + 300.0)
     for row, exposure in zip(axes, exposures, strict=True):
-        shown: list[tuple[str, Any]] = [("truth", seen.truth), *((m, seen.volumes[m, exposure][0]) for m in methods)]
+        shown: list[tuple[str, Any]] = [
+            ("truth", seen.truth),
+            *((m, seen.volumes[m, exposure][0]) for m in methods),
+        ]
         for ax, (name, volume) in zip(row, shown, strict=True):
-            ax.imshow(np.asarray(volume[z], np.float32), cmap="gray", vmin=low, vmax=high, origin="lower")
+            ax.imshow(
+                np.asarray(volume[z], np.float32), cmap="gray", vmin=low, vmax=high, origin="lower"
+            )
             ax.set_title(name if name == "truth" else f"{name}, {exposure:g} s", fontsize=6)
             ax.axis("off")
     return figure
@@ -230,8 +295,11 @@ def page(title: str, text: str, pictures: Mapping[str, bytes]) -> str:
     body = MarkdownIt("commonmark", {"html": False}).enable("table").render(text + rest)
     for name, content in pictures.items():
         kind = "svg+xml" if name.endswith(".svg") else "png"
-        body = body.replace(f'src="{name}"', f'src="data:image/{kind};base64,{base64_text(content)}"')
+        body = body.replace(
+            f'src="{name}"', f'src="data:image/{kind};base64,{base64_text(content)}"'
+        )
     return (
-        f'<!doctype html>\n<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        '<!doctype html>\n<html lang="en"><meta charset="utf-8"><meta name="viewport" '
+        'content="width=device-width">'
         f"<title>{html.escape(title)}</title><style>{_STYLE}</style>\n<body>{body}</body></html>\n"
     )

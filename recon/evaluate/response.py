@@ -1,10 +1,11 @@
 """The linear response of MBIR to the noise of its data: the best linear control of its figures.
 
-A backward pass gives g = ∂(ROI mean)/∂b of b = AᵀW y, and g·b of every draw costs nothing. Any functional g·b has the
-exactly known mean g·E[b] and covariance gᵀ Cov(b) g of the readings' noise, whatever the method; the closer g follows
-the method, the higher the correlation, and the fewer draws an interval needs (:mod:`torchpcct.metrics.control`). For
-Gaussian noise the best g of all is the gradient's expectation over the noise (Stein 1981, Ann. Statist. 9:1135, lemma
-1), here its mean over a few draws that serve nothing else.
+A backward pass gives g = ∂(ROI mean)/∂b of b = AᵀW y, and g·b of every draw costs nothing. Any
+functional g·b has the exactly known mean g·E[b] and covariance gᵀ Cov(b) g of the readings' noise,
+whatever the method; the closer g follows the method, the higher the correlation, and the fewer
+draws an interval needs (:mod:`torchpcct.metrics.control`). For Gaussian noise the best g of all is
+the gradient's expectation over the noise (Stein 1981, Ann. Statist. 9:1135, lemma 1), here its mean
+over a few draws that serve nothing else.
 """
 
 from __future__ import annotations
@@ -29,7 +30,11 @@ _SEED = 1 << 40
 
 
 def response(
-    method: Callable[[Tensor], Tensor], problem: InsetProblem, weights: Tensor, statistic: Tensor, exposure_s: float
+    method: Callable[[Tensor], Tensor],
+    problem: InsetProblem,
+    weights: Tensor,
+    statistic: Tensor,
+    exposure_s: float,
 ) -> Tensor:
     """g of every functional, HU per unit of b, ``(rows, z, y, x)`` float64.
 
@@ -50,21 +55,32 @@ def response(
         # One row at a time: a graph for all of them would hold several GB.
         for k, w in enumerate(weights):
             kept = k + 1 < len(weights)
-            g[k] += torch.autograd.grad(volume, leaf, w.to(volume)[None], retain_graph=kept)[0][0].double() / _DRAWS
+            g[k] += (
+                torch.autograd.grad(volume, leaf, w.to(volume)[None], retain_graph=kept)[0][
+                    0
+                ].double()
+                / _DRAWS
+            )
     return g
 
 
-def statistic_covariance(problem: InsetProblem, g: Tensor, exposure_s: float, clean: Scan) -> NDArray[np.float64]:
-    """gᵢᵀ Cov(b) gⱼ of functionals ``(m, z, y, x)`` of b = AᵀW y with the weights of an exposure, ``(m, m)``.
+def statistic_covariance(
+    problem: InsetProblem, g: Tensor, exposure_s: float, clean: Scan
+) -> NDArray[np.float64]:
+    """gᵢᵀ Cov(b) gⱼ of functionals ``(m, z, y, x)`` of b = AᵀW y with the weights of an exposure,
+    ``(m, m)``.
 
-    The weights W are those of the background, the readings' variances V those of the whole noise-free scan ``clean``
-    (delta method for their logarithm), so Cov(b) = AᵀW V W A: one projection per functional.
+    The weights W are those of the background, the readings' variances V those of the whole
+    noise-free scan ``clean`` (delta method for their logarithm), so Cov(b) = AᵀW V W A: one
+    projection per functional.
 
     Raises:
         ValueError: a scan that is noisy, or of another window than the problem's.
     """
     if clean.window != problem.outer or clean.geometry != problem.geometry:
-        raise ValueError("this scan has another geometry or window than the one the problem was made for")
+        raise ValueError(
+            "this scan has another geometry or window than the one the problem was made for"
+        )
     variance = line_integral_variance(clean.crop(problem.window), exposure_s)
     root = problem.weights * (exposure_s / NOISE_FREE_EXPOSURE_S) * variance.sqrt()
     rows = torch.stack([(problem.projector(v.to(root.dtype)) * root).flatten(1) for v in g])

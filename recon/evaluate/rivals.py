@@ -1,4 +1,5 @@
-"""What a reconstruction has to beat: filters of a finished volume (:mod:`recon.filters`) with tuned settings."""
+"""What a reconstruction has to beat: filters of a finished volume (:mod:`recon.filters`) with
+tuned settings."""
 
 from __future__ import annotations
 
@@ -39,15 +40,19 @@ __all__ = [
 
 @cache
 def _tuning() -> Any:
-    return json.loads((resources.files("recon") / "evaluate" / "rivals_tuning.json").read_text(encoding="utf-8"))
+    return json.loads(
+        (resources.files("recon") / "evaluate" / "rivals_tuning.json").read_text(encoding="utf-8")
+    )
 
 
 @checked
 def tuned(name: str, kernel: str, exposure_s: float) -> dict[str, Any]:
-    """Settings of a filter after FBP on 0.2 mm voxels that have the least error in vessels of four directions.
+    """Settings of a filter after FBP on 0.2 mm voxels that have the least error in vessels of four
+    directions.
 
-    Tuned on held-out plaques of the paper's scanner at 0.35, 0.7 and 2 s (``tests/bench/rivals.py``); the nearest
-    exposure counts. Thresholds are in units of the noise, so they serve other scanners.
+    Tuned on held-out plaques of the paper's scanner at 0.35, 0.7 and 2 s
+    (``tests/bench/rivals.py``); the nearest exposure counts. Thresholds are in units of the noise,
+    so they serve other scanners.
 
     Args:
         name: of :data:`FILTERS`.
@@ -55,13 +60,16 @@ def tuned(name: str, kernel: str, exposure_s: float) -> dict[str, Any]:
         exposure_s: of the scan.
 
     Returns:
-        Keyword arguments; empty where this pair was not tuned: then the filter's defaults are its best.
+        Keyword arguments; empty where this pair was not tuned: then the filter's defaults are its
+        best.
 
     Raises:
         ValueError: an unknown filter, an exposure that is not positive.
     """
     choice("filter", name, FILTERS)
     exposure = number("exposure_s", exposure_s, positive=True, unit="s")
-    nearest = min(_tuning().items(), key=lambda item: abs(math.log(float(item[0].split()[0]) / exposure)))[1]
+    nearest = min(
+        _tuning().items(), key=lambda item: abs(math.log(float(item[0].split()[0]) / exposure))
+    )[1]
     found: dict[str, Any] = dict(nearest.get(f"{kernel} + {name}", {}).get("settings", {}))
     return found

@@ -1,4 +1,5 @@
-"""What a result depends on: the sources its module imports, so that a change elsewhere spoils no finished piece."""
+"""What a result depends on: the sources its module imports, so that a change elsewhere spoils no
+finished piece."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ _DATA = ("weights/*.safetensors", "*.json")
 
 @functools.cache
 def source_digest(*modules: str) -> str:
-    """SHA-256 of the sources that these modules import, directly or not, and of the data beside them.
+    """SHA-256 of the sources that these modules import, directly or not, and of the data beside
+    them.
 
     Args:
         modules: names; those of other software do not count. None at all: all of this software.
@@ -32,11 +34,21 @@ def source_digest(*modules: str) -> str:
         seen: set[tuple[str, str]] = set()
         for name in modules:
             _follow(name, "", seen)
-        files = {Path(found[0]) for found in (_source(name) for name, _ in seen) if found is not None}
+        files = {
+            Path(found[0]) for found in (_source(name) for name, _ in seen) if found is not None
+        }
     else:
-        files = {Path(str(importlib.import_module(package).__file__)) for package in ("torchpcct", "recon")}
+        files = {
+            Path(str(importlib.import_module(package).__file__))
+            for package in ("torchpcct", "recon")
+        }
         endings = "**/*.py", *(f"**/{ending}" for ending in _DATA)
-    files |= {found for folder in {f.parent for f in files} for ending in endings for found in folder.glob(ending)}
+    files |= {
+        found
+        for folder in {f.parent for f in files}
+        for ending in endings
+        for found in folder.glob(ending)
+    }
     roots = Path(str(importlib.import_module("torchpcct").__file__)).parent.parent
     for path in sorted(files):
         total.update(path.relative_to(roots).as_posix().encode() + _content(path))
@@ -52,10 +64,11 @@ def _content(path: Path) -> bytes:
 
 @functools.cache
 def _source(name: str) -> tuple[str, bool, tuple[tuple[str, str], ...]] | None:
-    """File of a module, whether it is a package, and its imports: module and name (empty: the module itself).
+    """File of a module, whether it is a package, and its imports: module and name (empty: the
+    module itself).
 
-    Imports count wherever they stand, but for those of the type checker alone; in a package these say where the names
-    are that it loads when they are asked for. None: no module of this software.
+    Imports count wherever they stand, but for those of the type checker alone; in a package these
+    say where the names are that it loads when they are asked for. None: no module of this software.
     """
     if not f"{name}.".startswith(OURS):
         return None
@@ -73,9 +86,17 @@ def _source(name: str) -> tuple[str, bool, tuple[tuple[str, str], ...]] | None:
             found += [(alias.name, "") for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             found += [(str(node.module), alias.name) for alias in node.names]
-        checking = isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING" and not package
+        checking = (
+            isinstance(node, ast.If)
+            and getattr(node.test, "id", "") == "TYPE_CHECKING"
+            and not package
+        )
         for part in ("orelse",) if checking else ("body", "orelse", "finalbody", "handlers"):
-            nodes += getattr(node, part, ()) if isinstance(node, ast.stmt | ast.Module | ast.ExceptHandler) else ()
+            nodes += (
+                getattr(node, part, ())
+                if isinstance(node, ast.stmt | ast.Module | ast.ExceptHandler)
+                else ()
+            )
     return spec.origin, package, tuple(found)
 
 

@@ -1,4 +1,5 @@
-"""Finished pieces of a study on disk: each appears whole or not at all, and is reused by the next run."""
+"""Finished pieces of a study on disk: each appears whole or not at all, and is reused by the
+next run."""
 
 from __future__ import annotations
 
@@ -31,11 +32,12 @@ log = logging.getLogger(__name__)
 
 
 _TRIES = 100
-"""To write a piece, where others clear its folder; it is only kept for later, and a study goes on without."""
+"""To write a piece, where others clear its folder; it is only kept for later, and a study goes
+on without."""
 
 _MARK = "piece"
-"""What the store wrote carries its own file name under this name: a file is removed, or replaced by another piece, only
-if it says so itself. A folder of pieces may be the user's, or a link to one."""
+"""What the store wrote carries its own file name under this name: a file is removed, or replaced by
+another piece, only if it says so itself. A folder of pieces may be the user's, or a link to one."""
 _SCAN = re.compile(r"-[0-9a-f]{16}\.h5$")
 """Names of kept scans end so, with a task's fingerprint."""
 
@@ -50,9 +52,11 @@ def _digest(key: str, arrays: Mapping[str, Any]) -> str:
 
 
 class Store:
-    """A folder of ``.npz`` files, each with the key (settings, parameters) that it was made with, and its checksum.
+    """A folder of ``.npz`` files, each with the key (settings, parameters) that it was made with,
+    and its checksum.
 
-    The folder may hold files of others, and be a link: :meth:`clear` and :meth:`remove` touch only what a store wrote.
+    The folder may hold files of others, and be a link: :meth:`clear` and :meth:`remove` touch only
+    what a store wrote.
 
     Args:
         folder: made if need be.
@@ -89,7 +93,11 @@ class Store:
         path = self.folder / (name + ".npz")
         foreign = is_foreign(path)
         if foreign:
-            log.warning("%s is no piece of a study: it is left as it is, and the piece of that name is not kept", path)
+            log.warning(
+                "%s is no piece of a study: it is left as it is, and the piece of that name is "
+                "not kept",
+                path,
+            )
         elif path.exists():
             try:
                 with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
@@ -106,10 +114,16 @@ class Store:
         if foreign:
             return unpacked(arrays)
         digest = _digest(key, arrays)
-        sealed = {"key": np.array(key), "sum": np.array(digest), _MARK: np.array(path.name), **arrays}
+        sealed = {
+            "key": np.array(key),
+            "sum": np.array(digest),
+            _MARK: np.array(path.name),
+            **arrays,
+        }
         for _ in range(_TRIES):
             try:
-                with atomic_write(self.path(name + ".npz")) as part:  # its folder again, which others may clear
+                # its folder again, which others may clear
+                with atomic_write(self.path(name + ".npz")) as part:
                     np.savez(part, **sealed)
                 break
             except (FileNotFoundError, FileExistsError) as error:  # of its folder
@@ -121,7 +135,8 @@ class Store:
         replace(scan, info={**scan.info, _MARK: path.name}).save(path)
 
     def remove(self, path: Path) -> bool:
-        """Remove a file if a store wrote it under this name, or what a store that is dead was writing.
+        """Remove a file if a store wrote it under this name, or what a store that is dead was
+        writing.
 
         Returns:
             Whether it is gone.
@@ -132,15 +147,18 @@ class Store:
         return True
 
     def clear(self) -> None:
-        """Remove what stores wrote into the folder and below, and the folders that this leaves empty.
+        """Remove what stores wrote into the folder and below, and the folders that this leaves
+        empty.
 
-        All else stays: files of others, links, folders that were empty, and what is being written at this moment.
+        All else stays: files of others, links, folders that were empty, and what is being written
+        at this moment.
         """
         emptied = {str(self.folder)}
         for place, _, names in os.walk(self.folder, topdown=False):
             removed = [name for name in names if self.remove(Path(place, name))]
             if removed or place in emptied:
-                with contextlib.suppress(OSError):  # not empty: somebody writes, or it is the user's; or it is a link
+                # not empty: somebody writes, or it is the user's; or it is a link
+                with contextlib.suppress(OSError):
                     os.rmdir(place)
                     emptied.add(os.path.dirname(place))
 
@@ -165,11 +183,13 @@ T = TypeVar("T")
 
 
 class Pieces:
-    """Finished parts of one study, of whatever kind, so that the same command goes on after an interruption.
+    """Finished parts of one study, of whatever kind, so that the same command goes on after an
+    interruption.
 
-    A piece is used again only with the same settings and the same source (and weights) of all that the study imports:
-    a result never mixes two versions of them. Unlike those of a :class:`Store` that a study fills on purpose, they are
-    of no use once the report stands: :meth:`clear` takes them away.
+    A piece is used again only with the same settings and the same source (and weights) of all that
+    the study imports: a result never mixes two versions of them. Unlike those of a :class:`Store`
+    that a study fills on purpose, they are of no use once the report stands: :meth:`clear` takes
+    them away.
 
     Args:
         folder: of the study's results, where they lie in ``pieces``; None: nothing is kept.
@@ -191,7 +211,10 @@ class Pieces:
             ValueError: a name that was asked for already, which would give the other piece.
         """
         if self._prefix + name in self._asked:
-            raise ValueError(f"two pieces of a study have the name {self._prefix + name!r}: name one of them otherwise")
+            raise ValueError(
+                f"two pieces of a study have the name {self._prefix + name!r}: name one of them "
+                "otherwise"
+            )
         self._asked.add(self._prefix + name)
         if self._store is None:
             return compute()
@@ -199,12 +222,14 @@ class Pieces:
         return found
 
     def ahead(self, function: Callable[..., Any], *calls: tuple[Any, ...]) -> None:
-        """Let other processes compute pieces of calls that are independent, before this one reads them one by one.
+        """Let other processes compute pieces of calls that are independent, before this one reads
+        them one by one.
 
         Nothing without an executor (:mod:`recon.evaluate.execute`), or where nothing is kept.
 
         Args:
-            function: of a module; called as ``function(settings, pieces, *call)`` it computes pieces as the study does.
+            function: of a module; called as ``function(settings, pieces, *call)`` it computes
+                pieces as the study does.
             calls: texts and numbers, which also name the job.
         """
         executor = execute.current()
@@ -213,15 +238,26 @@ class Pieces:
         name = function.__name__.strip("_")
         jobs = [
             execute.Job(
-                " ".join(map(str, (name, *call))), _ahead, (self._settings, self._prefix, function, call),
-                makes=("**/*.npz",), module=function.__module__,
+                " ".join(map(str, (name, *call))),
+                _ahead,
+                (self._settings, self._prefix, function, call),
+                makes=("**/*.npz",),
+                module=function.__module__,
             )
             for call in calls
-        ]  # fmt: skip
-        done = {job.name: f"done/{hashlib.sha256((self._prefix + job.name).encode()).hexdigest()[:12]}" for job in jobs}
+        ]
+        done = {
+            job.name: f"done/{hashlib.sha256((self._prefix + job.name).encode()).hexdigest()[:12]}"
+            for job in jobs
+        }
         left = [job for job in jobs if not self._store.has(done[job.name], self._key)]
         store, key = self._store, self._key
-        execute.run(left, store.folder, executor, finished=lambda job: store.piece(done[job.name], key, dict))
+        execute.run(
+            left,
+            store.folder,
+            executor,
+            finished=lambda job: store.piece(done[job.name], key, dict),
+        )
 
     def within(self, prefix: str) -> Pieces:
         """The same, with names that begin with ``prefix/``."""
@@ -230,7 +266,8 @@ class Pieces:
         return other
 
     def folder(self, name: str) -> Path | None:
-        """For an evaluation that is part of the study and keeps its own pieces; None: nothing is kept."""
+        """For an evaluation that is part of the study and keeps its own pieces; None: nothing is
+        kept."""
         return None if self._store is None else self._store.folder / self._prefix / name
 
     @classmethod
@@ -240,14 +277,17 @@ class Pieces:
             Store(Path(folder) / cls.FOLDER).clear()
 
 
-def _ahead(root: Path, settings: Any, prefix: str, function: Callable[..., Any], call: tuple[Any, ...]) -> None:
+def _ahead(
+    root: Path, settings: Any, prefix: str, function: Callable[..., Any], call: tuple[Any, ...]
+) -> None:
     pieces = Pieces(root.parent, settings)
     pieces._prefix = prefix
     function(settings, pieces, *call)
 
 
 def _study_digest(settings: Any) -> str:
-    """Of the module of a study, in which its settings stand beside its measuring, with all it imports."""
+    """Of the module of a study, in which its settings stand beside its measuring, with all it
+    imports."""
     module = type(settings).__module__
     return source_digest(module) if module.startswith("recon.") else source_digest()
 
@@ -256,8 +296,9 @@ def packed(value: Any) -> dict[str, Any]:
     """Arrays, and under ``tree`` the JSON text of what they make up, for :meth:`Store.piece`.
 
     Args:
-        value: None, truth values, numbers, texts, arrays, tensors, dataclasses of this software (their fields that are
-            given at construction), and lists, tuples and dictionaries of all these.
+        value: None, truth values, numbers, texts, arrays, tensors, dataclasses of this software
+            (their fields that are given at construction), and lists, tuples and dictionaries of all
+            these.
 
     Raises:
         TypeError: a value of another kind.
@@ -271,13 +312,21 @@ def _packed(value: Any, arrays: dict[str, Any]) -> Any:
         return value
     if isinstance(value, np.ndarray | np.generic | torch.Tensor):
         name = f"a{len(arrays)}"
-        arrays[name] = value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+        arrays[name] = (
+            value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+        )
         if arrays[name].dtype.hasobject:
             raise TypeError("a piece of a study cannot hold an array of Python objects")
         kinds = {torch.Tensor: "tensor", np.ndarray: "array"}
-        return {next((text for kind, text in kinds.items() if isinstance(value, kind)), "scalar"): name}
+        return {
+            next((text for kind, text in kinds.items() if isinstance(value, kind)), "scalar"): name
+        }
     if isinstance(value, list | tuple):
-        return {type(value).__name__ if type(value) in (list, tuple) else "tuple": [_packed(v, arrays) for v in value]}
+        return {
+            type(value).__name__ if type(value) in (list, tuple) else "tuple": [
+                _packed(v, arrays) for v in value
+            ]
+        }
     if isinstance(value, Mapping):
         return {"dict": [[_packed(k, arrays), _packed(v, arrays)] for k, v in value.items()]}
     kind = type(value)

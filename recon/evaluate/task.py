@@ -1,16 +1,19 @@
 """A task: a thing to see or to measure, what it lies in, and the scanner that looks at it.
 
-A task is data. It has a scene, a *signal* (one body of it, or several) and a *background* (the body around). The scene
-without signal has the background's material in its place. From these follows what is read of every volume:
+A task is data. It has a scene, a *signal* (one body of it, or several) and a *background* (the body
+around). The scene without signal has the background's material in its place. From these follows
+what is read of every volume:
 
-* ``lesion``: mean over the whole signal less mean over the background around it; ``slice``: the same in the axial slice
-  that holds most of the signal; ``small``: of some voxels in the signal's middle and the nearest of the background;
-* the root mean square error near the bodies and beside the signal, and the noise in every tissue that fills a part of
-  the inset;
+* ``lesion``: mean over the whole signal less mean over the background around it; ``slice``: the
+  same in the axial slice that holds most of the signal; ``small``: of some voxels in the signal's
+  middle and the nearest of the background;
+* the root mean square error near the bodies and beside the signal, and the noise in every tissue
+  that fills a part of the inset;
 * contrast invented where nothing is, and contours that are not there;
 * whether the signal is there, by an observer who knows where (:mod:`recon.evaluate.estimates`).
 
-Ready ones are in :mod:`recon.evaluate.tasks`; ``torchpcct show-task NAME`` prints one as YAML to start from.
+Ready ones are in :mod:`recon.evaluate.tasks`; ``torchpcct show-task NAME`` prints one as YAML to
+start from.
 """
 
 from __future__ import annotations
@@ -49,25 +52,35 @@ Floats = NDArray[np.float64]
 Pair = tuple[Tensor, Tensor]
 
 ROIS = ("small", "slice", "lesion")
-_PURE, _MOSTLY = 0.99, 0.8
+_PURE = 0.99
+_MOSTLY = 0.8
 """Share of a tissue in the voxels that are read; where there are too few, the second."""
 _FEW = 4
 _AROUND_MM = 1.5
 """The background is read as far from the signal."""
 _SMALL_MM2 = 0.25
 """Area of the small ROIs, about that of the paper's."""
-_NEAR_MM, _RIM_MM = 0.4, 0.8
-"""The error is that of bodies and of what lies so close to them; a rim is looked for so far from them."""
+_NEAR_MM = 0.4
+_RIM_MM = 0.8
+"""The error is that of bodies and of what lies so close to them; a rim is looked for so far from
+them."""
 BESIDE_MM = 0.6
 """So far the blur of an edge reaches; what is so close to the signal is beside it."""
-_ABOUT_MM, _SHELL_MM, _INSET_RIM_MM = 1.5, 0.2, 0.8
-"""What is about a body; width of the shells around it; of the inset's rim, where little is measured."""
-_FLAT_MM, _FLAT_VOXELS, _KEPT_VOXELS = 1.0, 150, 2000
+_ABOUT_MM = 1.5
+_SHELL_MM = 0.2
+_INSET_RIM_MM = 0.8
+"""What is about a body; width of the shells around it; of the inset's rim, where little is
+measured."""
+_FLAT_MM = 1.0
+_FLAT_VOXELS = 150
+_KEPT_VOXELS = 2000
 """Noise is that of voxels so far from any edge; of tissues with so many; of so many at most."""
 _LINES = 32
 """Lines per voxel edge of the true shares: to 0.1 HU rms, 9 HU beside metal of 110 000."""
-_VIEWS, _SUB_RAYS = 246, 16
-"""Views that values and limit are summed over (path lengths change slowly from view to view), beam samples."""
+_VIEWS = 246
+_SUB_RAYS = 16
+"""Views that values and limit are summed over (path lengths change slowly from view to view),
+beam samples."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +89,10 @@ class Facts:
 
     Attributes:
         tissues: names, the signal first, then the background.
-        values_hu: what each reads on this scanner at this place, by least squares on the noise-free readings.
-        limit_hu: smallest SD at 1 s of any unbiased estimate of background less signal, all outlines known.
+        values_hu: what each reads on this scanner at this place, by least squares on the noise-free
+            readings.
+        limit_hu: smallest SD at 1 s of any unbiased estimate of background less signal, all
+            outlines known.
     """
 
     tissues: tuple[str, ...]
@@ -104,7 +119,8 @@ class Task:
         grid: ``(z, y, x)`` cubic voxels about the signal, small against the field of view.
         exposures_s: at which it is usually looked at.
         reference: FBP that factors are quoted against (:func:`recon.evaluate.methods.method_of`).
-        rois: name → weights of signal and background ``grid.shape`` that add up to 1 each; None: see the module.
+        rois: name → weights of signal and background ``grid.shape`` that add up to 1 each; None:
+            see the module.
         tolerance_hu: effects of the scan below it are left out (:func:`torchpcct.acquire`).
 
     Raises:
@@ -126,7 +142,8 @@ class Task:
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}", str(self.name)):
             raise ValueError(
-                "the name of a task is that of its files: letters, digits, '.', '_' and '-', at most 64, no '.' at the "
+                "the name of a task is that of its files: letters, digits, '.', '_' and '-', at "
+                "most 64, no '.' at the "
                 f"start; got {str(self.name)[:80]!r}"
             )
         signal = (self.signal,) if isinstance(self.signal, str) else tuple(self.signal)
@@ -134,16 +151,30 @@ class Task:
             raise ValueError(f"task {self.name}: signal names no body of the scene")
         for name in (*signal, *([self.background] if self.background else [])):
             if name not in self.names:
-                raise ValueError(f"task {self.name}: no body {name!r} in the scene, which has {', '.join(self.names)}")
+                raise ValueError(
+                    f"task {self.name}: no body {name!r} in the scene, which has "
+                    f"{', '.join(self.names)}"
+                )
         background = self.background or self.scene[signal[0]].parent
         if background is None:
-            raise ValueError(f"task {self.name}: {signal[0]!r} lies in no other body: name the background")
+            raise ValueError(
+                f"task {self.name}: {signal[0]!r} lies in no other body: name the background"
+            )
         if background in signal:
             raise ValueError(f"task {self.name}: {background!r} is both signal and background")
-        if self.grid.ndim != 3 or max(abs(s / self.grid.spacing[0] - 1.0) for s in self.grid.spacing) > 0.01:
-            raise ValueError(f"task {self.name}: the inset must have cubic voxels (z, y, x), got {self.grid}")
+        if (
+            self.grid.ndim != 3
+            or max(abs(s / self.grid.spacing[0] - 1.0) for s in self.grid.spacing) > 0.01
+        ):
+            raise ValueError(
+                f"task {self.name}: the inset must have cubic voxels (z, y, x), got {self.grid}"
+            )
         exposures = tuple(numbers("exposures_s", self.exposures_s, positive=True, unit="s"))
-        for name, value in (("signal", signal), ("background", background), ("exposures_s", exposures)):
+        for name, value in (
+            ("signal", signal),
+            ("background", background),
+            ("exposures_s", exposures),
+        ):
             object.__setattr__(self, name, value)
 
     @property
@@ -163,29 +194,37 @@ class Task:
     def fingerprint(self) -> str:
         """Of all that a task's results depend on: itself, and the sources that compute them."""
         digest = source_digest("recon.evaluate.measure", type(self).__module__)
-        plain = [_plain(getattr(self, f.name)) for f in fields(self) if f.name not in ("title", "exposures_s")]
+        plain = [
+            _plain(getattr(self, f.name))
+            for f in fields(self)
+            if f.name not in ("title", "exposures_s")
+        ]
         return hashlib.sha256(f"{plain} {digest}".encode()).hexdigest()[:16]
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what it has kept of its own computations, to be sent."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
-    # --- noise-free scans and what they say ---------------------------------------------------------------------
+    # --- noise-free scans and what they say -------------------------------------------------------
 
     def scans(self, store: Store) -> tuple[Scan, Scan]:
         """Noise-free scans with and without the signal, kept in ``store``."""
         return self.scan(store, "present"), self.scan(store, "absent")
 
     def scan(self, store: Store, signal: str) -> Scan:
-        """Noise-free scan of the scene with the signal ``"present"`` or ``"absent"``, kept in ``store``."""
+        """Noise-free scan of the scene with the signal ``"present"`` or ``"absent"``, kept in
+        ``store``."""
         path = self.scan_file(store, signal)
         if not path.exists():
             scene = self.scene if signal == "present" else self.absent
             try:
-                made = acquire(scene, self.scanner, region=self.grid, tolerance_hu=self.tolerance_hu)
+                made = acquire(
+                    scene, self.scanner, region=self.grid, tolerance_hu=self.tolerance_hu
+                )
             except ValueError as error:
                 raise ValueError(
-                    f"task {self.name}: {error} (outside of the inset a task's scene must be round about the axis)"
+                    f"task {self.name}: {error} (outside of the inset a task's scene must be "
+                    "round about the axis)"
                 ) from error
             store.keep_scan(made, path)
         return Scan.load(path)
@@ -199,7 +238,8 @@ class Task:
         return path
 
     def facts(self, store: Store) -> Facts:
-        """Values of the tissues and the limit of the data; bodies of one material count as one tissue."""
+        """Values of the tissues and the limit of the data; bodies of one material count as one
+        tissue."""
         return self._facts_of(*self.scans(store))
 
     def _facts_of(self, present: Scan, absent: Scan) -> Facts:
@@ -209,9 +249,13 @@ class Task:
         values = seen.values(maps, information)
         # The signal by what it changes: whatever else the readings hold drops out.
         change = seen.lines - absent.line_integrals()[seen.views]
-        differs = _inner(maps[0], seen.weight * change) * seen.scale * seen.share / information[0, 0]
+        differs = (
+            _inner(maps[0], seen.weight * change) * seen.scale * seen.share / information[0, 0]
+        )
         values[0] = values[1] + differs
-        return Facts(tuple(self._groups), tuple(float(v) for v in values), contrast_limit(information))
+        return Facts(
+            tuple(self._groups), tuple(float(v) for v in values), contrast_limit(information)
+        )
 
     @cached_property
     def _groups(self) -> dict[str, list[str]]:
@@ -223,18 +267,23 @@ class Task:
                 found.setdefault(tissue.setdefault(material.name, body.name), []).append(body.name)
         return found
 
-    # --- where is what -------------------------------------------------------------------------------------------
+    # --- where is what ----------------------------------------------------------------------------
 
     @cached_property
     def shares(self) -> dict[str, Floats]:
         """Tissue → its share of every voxel, ``grid.shape``; the signal's under ``signal``."""
         fractions = self._fractions
-        return {tissue: np.sum([fractions[n] for n in names], axis=0) for tissue, names in self._groups.items()}
+        return {
+            tissue: np.sum([fractions[n] for n in names], axis=0)
+            for tissue, names in self._groups.items()
+        }
 
     @cached_property
     def _fractions(self) -> dict[str, Floats]:
         """Body → its share of every voxel."""
-        return dict(zip(self.scene.names, self.scene.volume_fractions(self.grid, _LINES), strict=True))
+        return dict(
+            zip(self.scene.names, self.scene.volume_fractions(self.grid, _LINES), strict=True)
+        )
 
     @property
     def _beside(self) -> Floats:
@@ -242,11 +291,16 @@ class Task:
         return self._fractions[self.background]
 
     def truth(self, facts: Facts) -> tuple[Tensor, Tensor]:
-        """HU of every voxel with and without the signal, ``grid.shape`` float32; outside of all bodies air."""
+        """HU of every voxel with and without the signal, ``grid.shape`` float32; outside of all
+        bodies air."""
         values = dict(zip(facts.tissues, facts.values_hu, strict=True))
         outside = 1.0 - np.sum(list(self.shares.values()), axis=0)
         absent = np.sum(
-            [share * values[self.background if t == "signal" else t] for t, share in self.shares.items()], axis=0
+            [
+                share * values[self.background if t == "signal" else t]
+                for t, share in self.shares.items()
+            ],
+            axis=0,
         )
         absent = absent - 1000.0 * outside
         present = absent - facts.contrast_hu * self.shares["signal"]
@@ -269,7 +323,8 @@ class Task:
         for name, (_, outer) in found.items():
             if not outer.any():
                 raise ValueError(
-                    f"task {self.name}: no voxel beside the signal lies wholly in {self.background!r} (ROI {name}): "
+                    f"task {self.name}: no voxel beside the signal lies wholly in "
+                    f"{self.background!r} (ROI {name}): "
                     "take smaller voxels, or name another background"
                 )
         pairs = {n: (_mean(a), _mean(b)) for n, (a, b) in found.items()}
@@ -291,12 +346,14 @@ class Task:
             if (share > least).sum() >= _FEW:
                 return np.asarray(share > least)
         raise ValueError(
-            f"task {self.name}: {int((share > _MOSTLY).sum())} voxels of the inset lie in {name!r}, {_FEW} are needed: "
+            f"task {self.name}: {int((share > _MOSTLY).sum())} voxels of the inset lie in "
+            f"{name!r}, {_FEW} are needed: "
             "take smaller voxels, or an inset that holds it"
         )
 
     def _small(self, signal: Any, around: Any, here: Any) -> tuple[Any, Any]:
-        """Voxels of one slice in the middle of the signal, and near to them where the background is not thin."""
+        """Voxels of one slice in the middle of the signal, and near to them where the background
+        is not thin."""
         step = self.grid.spacing
         count = max(_FEW, round(_SMALL_MM2 / (step[1] * step[2])))
         depth = np.where(signal & here, _depth(signal, step), -1.0)
@@ -316,7 +373,8 @@ class Task:
 
     @cached_property
     def near(self) -> Tensor:
-        """Mask ``grid.shape`` in which the error counts: all but what the bodies lie in, and what is close to it."""
+        """Mask ``grid.shape`` in which the error counts: all but what the bodies lie in, and
+        what is close to it."""
         bodies = self._rest < 0.5
         bodies |= self.shares["signal"] > 0.5
         away = ndimage.distance_transform_edt(~bodies, sampling=self.grid.spacing)
@@ -326,17 +384,22 @@ class Task:
     def beside(self) -> Tensor:
         """Mask ``grid.shape`` of the signal and what is beside it."""
         signal = self._signal_voxels | (self.shares["signal"] > 0.5)
-        return torch.from_numpy(ndimage.distance_transform_edt(~signal, sampling=self.grid.spacing) <= BESIDE_MM)
+        return torch.from_numpy(
+            ndimage.distance_transform_edt(~signal, sampling=self.grid.spacing) <= BESIDE_MM
+        )
 
     @cached_property
     def quiet(self) -> Tensor:
-        """Mask ``grid.shape`` of tissue about the bodies, so far from all edges that their blur does not reach there:
-        whatever contrast a volume shows within it is invented."""
+        """Mask ``grid.shape`` of tissue about the bodies, so far from all edges that their blur
+        does not reach there: whatever contrast a volume shows within it is invented."""
         tissue = np.argmax(self._constant, axis=0)
         mixed = np.max(self._constant, axis=0) < 1.0 - 1e-6
         edges = mixed | (ndimage.maximum_filter(tissue, 3) != ndimage.minimum_filter(tissue, 3))
         away = ndimage.distance_transform_edt(~edges, sampling=self.grid.spacing)
-        about = ndimage.distance_transform_edt(self._rest > 0.5, sampling=self.grid.spacing) <= _ABOUT_MM
+        about = (
+            ndimage.distance_transform_edt(self._rest > 0.5, sampling=self.grid.spacing)
+            <= _ABOUT_MM
+        )
         return torch.from_numpy((away > BESIDE_MM) & about & self._inner)
 
     @property
@@ -354,23 +417,28 @@ class Task:
 
     @cached_property
     def shells(self) -> tuple[Tensor, ...]:
-        """Masks ``grid.shape`` about the bodies, the signal none of them if there are others, from near to far."""
+        """Masks ``grid.shape`` about the bodies, the signal none of them if there are others,
+        from near to far."""
         signal = self.shares["signal"]
         others = np.sum(list(self.shares.values()), axis=0) - self._rest - signal > 0.5
         bodies = others if others.any() else signal > 0.5
         away = ndimage.distance_transform_edt(~bodies, sampling=self.grid.spacing)
         ends = np.arange(BESIDE_MM, _ABOUT_MM + BESIDE_MM, _SHELL_MM)
-        return tuple(torch.from_numpy((away > end) & (away <= end + _SHELL_MM) & self._inner) for end in ends)
+        return tuple(
+            torch.from_numpy((away > end) & (away <= end + _SHELL_MM) & self._inner) for end in ends
+        )
 
     @cached_property
     def rim(self) -> Tensor:
-        """Mask ``grid.shape`` of the largest tissue's pure voxels beside bodies, where sharpening undershoots."""
+        """Mask ``grid.shape`` of the largest tissue's pure voxels beside bodies, where
+        sharpening undershoots."""
         pure = self.shares[self._largest] > 1.0 - 1e-6
         return torch.from_numpy(pure & (_depth(pure, self.grid.spacing) <= _RIM_MM))
 
     @cached_property
     def flat(self) -> dict[str, Tensor]:
-        """Tissue → indices (of the flat volume) of voxels away from its edges and the rim of the inset."""
+        """Tissue → indices (of the flat volume) of voxels away from its edges and the rim of the
+        inset."""
         found = {}
         for tissue, share in self.shares.items():
             deep = _depth(share > 1.0 - 1e-6, self.grid.spacing) > _FLAT_MM
@@ -383,7 +451,10 @@ class Task:
     def middle_mm(self) -> tuple[float, float, float]:
         """``(z, y, x)`` of the signal's centre of mass."""
         at = ndimage.center_of_mass(self.shares["signal"])
-        z, y, x = (float(np.interp(p, np.arange(len(a)), a)) for p, a in zip(at, self.grid.axes, strict=True))
+        z, y, x = (
+            float(np.interp(p, np.arange(len(a)), a))
+            for p, a in zip(at, self.grid.axes, strict=True)
+        )
         return z, y, x
 
 
@@ -407,9 +478,13 @@ class SomeViews:
     def path_lengths(self, task: Task, groups: list[list[str]]) -> list[Tensor]:
         """Of groups of the scene's bodies, mm."""
         maps = tissue_path_lengths(
-            task.scene, groups, self.geometry, self.window, sub_rays=_SUB_RAYS,
+            task.scene,
+            groups,
+            self.geometry,
+            self.window,
+            sub_rays=_SUB_RAYS,
             focal_spot=task.scanner.source.focal_spot,
-        )  # fmt: skip
+        )
         return list(maps)
 
     def information(self, maps: list[Tensor]) -> Floats:
@@ -417,8 +492,11 @@ class SomeViews:
         return information_matrix(maps, self.weight, scale=self.scale) * self.share
 
     def values(self, maps: list[Tensor], information: Floats) -> Floats:
-        """Least squares for the values of tissues with these path lengths and their information, HU."""
-        right = self.scale * self.share * np.array([_inner(m, self.weight * self.lines) for m in maps])
+        """Least squares for the values of tissues with these path lengths and their information,
+        HU."""
+        right = (
+            self.scale * self.share * np.array([_inner(m, self.weight * self.lines) for m in maps])
+        )
         return np.asarray(np.linalg.solve(information, right) - 1000.0)
 
 
@@ -434,7 +512,9 @@ def _plain(value: Any) -> Any:
         array = np.ascontiguousarray(value)
         return str(array.dtype), array.shape, hashlib.sha256(array.tobytes()).hexdigest()
     if is_dataclass(value) and not isinstance(value, type):
-        return type(value).__name__, [(f.name, _plain(getattr(value, f.name))) for f in fields(value)]
+        return type(value).__name__, [
+            (f.name, _plain(getattr(value, f.name))) for f in fields(value)
+        ]
     if isinstance(value, Scene):
         return [_plain(b) for b in value.bodies], [_plain(m) for m in value.motion]
     if isinstance(value, Mapping):
@@ -455,7 +535,9 @@ def _mean(mask: Any) -> Tensor:
 
 def _depth(mask: Any, step: Any) -> Floats:
     """Distance in mm to where the mask ends."""
-    return np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1, mode="edge"), sampling=step))[1:-1, 1:-1, 1:-1]
+    return np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1, mode="edge"), sampling=step))[
+        1:-1, 1:-1, 1:-1
+    ]
 
 
 def _nearest(mask: Any, point: Any, count: int) -> NDArray[np.bool_]:

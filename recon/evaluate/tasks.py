@@ -57,7 +57,8 @@ _KEYS = (
 )
 _VOXEL_MM = 0.2
 """What MBIR's network was trained on."""
-_FEATURE, _FAT = "feature", "fat"
+_FEATURE = "feature"
+_FAT = "fat"
 """The signal of an anatomy; its tissue that is the patient's."""
 
 
@@ -75,7 +76,8 @@ def read_task(what: Any) -> Task:
     """A task from its name (:data:`TASKS`), from a YAML file, or as it is.
 
     Raises:
-        ValueError, TypeError: an unknown name, a file that describes no task; the message names what is wrong.
+        ValueError, TypeError: an unknown name, a file that describes no task; the message names
+            what is wrong.
         FileNotFoundError: no such file.
     """
     if isinstance(what, Task):
@@ -90,28 +92,42 @@ def read_task(what: Any) -> Task:
 
 def _task(values: Any, name: str, folder: Path) -> Task:
     if not isinstance(values, Mapping):
-        raise ValueError(f"task {name} must be a mapping with {', '.join(_KEYS)}; see torchpcct show-task")
+        raise ValueError(
+            f"task {name} must be a mapping with {', '.join(_KEYS)}; see torchpcct show-task"
+        )
     unknown = [str(k) for k in values if k not in _KEYS]
     if unknown:
         raise ValueError(f"task {name}: unknown {', '.join(unknown)}; it takes {', '.join(_KEYS)}")
     for key in ("scene", "signal", "inset"):
         if key not in values:
             raise ValueError(f"task {name} needs {key}; see torchpcct show-task plaque")
-    name = str(values["name"]) if "name" in values else re.sub(r"[^A-Za-z0-9._-]", "_", name).lstrip(".")[:64] or "task"
-    config = configured({k: values[k] for k in ("scene", "scanner", "tolerance_hu") if k in values}, folder)
+    name = (
+        str(values["name"])
+        if "name" in values
+        else re.sub(r"[^A-Za-z0-9._-]", "_", name).lstrip(".")[:64] or "task"
+    )
+    config = configured(
+        {k: values[k] for k in ("scene", "scanner", "tolerance_hu") if k in values}, folder
+    )
     scene = config.scene
     if not isinstance(scene, Scene):
-        raise ValueError(f"task {name}: the scene must be made of bodies (kind plaque, thorax, water or bodies)")
+        raise ValueError(
+            f"task {name}: the scene must be made of bodies (kind plaque, thorax, water or bodies)"
+        )
     signal = values["signal"]
     signal = (signal,) if isinstance(signal, str) else tuple(signal)
     if not signal:
         raise ValueError(f"task {name}: signal names no body of the scene")
-    given: dict[str, Any] = {k: values[k] for k in ("background", "title", "reference") if k in values}
+    given: dict[str, Any] = {
+        k: values[k] for k in ("background", "title", "reference") if k in values
+    }
     if "exposures_s" in values:
         given["exposures_s"] = tuple(np.ravel(values["exposures_s"]).tolist())
     kinds = [key for key in ("vessel", "voxels", "anatomy") if key in values]
     if len(kinds) > 1:
-        raise ValueError(f"task {name}: {' and '.join(kinds)} are of different kinds of task: give one of them")
+        raise ValueError(
+            f"task {name}: {' and '.join(kinds)} are of different kinds of task: give one of them"
+        )
     make: Any = Task
     if "voxels" in values:
         make, given = VoxelTask, given | _labels(f"task {name}: voxels", values["voxels"], folder)
@@ -121,7 +137,9 @@ def _task(values: Any, name: str, folder: Path) -> Task:
         given["anatomy"], make = choice("anatomy", values["anatomy"], tuple(ANATOMIES)), AnatomyTask
     painted = issubclass(make, _PaintedTask)
     grid = _inset(f"task {name}: inset", values["inset"], scene, () if painted else signal)
-    task: Task = make(name, scene, signal, config.scanner, grid, tolerance_hu=config.tolerance_hu, **given)
+    task: Task = make(
+        name, scene, signal, config.scanner, grid, tolerance_hu=config.tolerance_hu, **given
+    )
     if values.get("rois") is None:
         return task
     choice("rois", values["rois"], ("protocol",))
@@ -135,7 +153,9 @@ def _inset(name: str, value: Any, scene: Scene, signal: tuple[str, ...]) -> Volu
         return grid_of(name, value)
     unknown = [str(k) for k in value if k not in ("size", "voxel_mm", "center")]
     if unknown:
-        raise ValueError(f"{name}: unknown {', '.join(unknown)}; with size it takes voxel_mm and center")
+        raise ValueError(
+            f"{name}: unknown {', '.join(unknown)}; with size it takes voxel_mm and center"
+        )
 
     def triple(what: Any) -> list[float]:
         return [what[a] for a in "zyx"] if isinstance(what, Mapping) else list(what)
@@ -144,7 +164,9 @@ def _inset(name: str, value: Any, scene: Scene, signal: tuple[str, ...]) -> Volu
     voxel = number(f"{name}.voxel_mm", value.get("voxel_mm", _VOXEL_MM), positive=True, unit="mm")
     shape = tuple(int(np.ceil(s / voxel - 1e-6)) for s in size)
     if "center" in value:
-        return VolumeGrid(shape, voxel, tuple(numbers(f"{name}.center", triple(value["center"]), 3)))
+        return VolumeGrid(
+            shape, voxel, tuple(numbers(f"{name}.center", triple(value["center"]), 3))
+        )
     if not signal:
         raise ValueError(f"{name} needs center {{z, y, x}} in mm: that is where the voxels are put")
     # About what the signal lies in, where that is small: a plaque's vessel, not a patient.
@@ -161,26 +183,39 @@ def _inset(name: str, value: Any, scene: Scene, signal: tuple[str, ...]) -> Volu
 
 def _labels(name: str, value: Any, folder: Path) -> dict[str, Any]:
     """``file`` and ``tissues`` of a task's ``voxels``."""
-    if not isinstance(value, Mapping) or set(value) != {"file", "tissues"} or not isinstance(value["tissues"], Mapping):
-        raise ValueError(f"{name} takes file, a volume of whole numbers, and tissues {{name: {{label: 1, hu: 50}}}}")
+    if (
+        not isinstance(value, Mapping)
+        or set(value) != {"file", "tissues"}
+        or not isinstance(value["tissues"], Mapping)
+    ):
+        raise ValueError(
+            f"{name} takes file, a volume of whole numbers, and tissues {{name: {{label: 1, hu: "
+            f"50}}}}"
+        )
     tissues = {}
     for tissue, of in value["tissues"].items():
         if not isinstance(of, Mapping) or set(of) != {"label", "hu"}:
             raise ValueError(f"{name}: tissue {tissue!r} needs label and hu, got {of!r}")
-        tissues[str(tissue)] = (whole(f"{name}: label of {tissue}", of["label"], 1), number(f"{name}: hu", of["hu"]))
+        tissues[str(tissue)] = (
+            whole(f"{name}: label of {tissue}", of["label"], 1),
+            number(f"{name}: hu", of["hu"]),
+        )
     volume = Volume.load(folder / str(value["file"]))
     return {"labels": np.asarray(volume.data), "spacing": volume.grid.spacing, "tissues": tissues}
 
 
 def _protocol(plaque: Plaque, grid: VolumeGrid) -> dict[str, Any]:
-    """The ROIs of the paper, and the same two tissues in the whole section and in all slices of the core."""
+    """The ROIs of the paper, and the same two tissues in the whole section and in all slices of
+    the core."""
     plain = plaque_scene(plaque)[0]
     x, y, z = (float(v) for v in plaque.to_scanner(plaque.core_center))
     half = float(plaque.core.semi_axes[2])
     pairs = {
         "small": place_rois(plain, axial_grid(grid.center)),
         "slice": whole_rois(plain, VolumeGrid((1, 80, 80), 0.04, (grid.center[0], y, x))),
-        "lesion": whole_rois(plain, VolumeGrid((max(1, int(2 * half / 0.05)), 64, 64), 0.05, (z, y, x))),
+        "lesion": whole_rois(
+            plain, VolumeGrid((max(1, int(2 * half / 0.05)), 64, 64), 0.05, (z, y, x))
+        ),
     }
     return {name: tuple(roi.weights for roi in pair.on(grid)) for name, pair in pairs.items()}
 
@@ -189,8 +224,8 @@ def _protocol(plaque: Plaque, grid: VolumeGrid) -> dict[str, Any]:
 class VesselTask(Task):
     """The paper's plaque on a vessel of any direction.
 
-    The scene gives patient, tissues and scanner; the vessel is painted on 0.1 mm voxels and projected, and changes the
-    counts of the patient without it.
+    The scene gives patient, tissues and scanner; the vessel is painted on 0.1 mm voxels and
+    projected, and changes the counts of the patient without it.
 
     Args:
         direction: a name of :data:`recon.evaluate.vessels.SHAPES`.
@@ -213,10 +248,17 @@ class VesselTask(Task):
         if not all(p.exists() for p in paths):
             straight = super().scans(store)
             facts = self._facts_of(*straight)
-            values = {("core" if t == "signal" else t): v for t, v in zip(facts.tissues, facts.values_hu, strict=True)}
+            values = {
+                ("core" if t == "signal" else t): v
+                for t, v in zip(facts.tissues, facts.values_hu, strict=True)
+            }
             for path, core in zip(paths, (values["core"], values["fibrous"]), strict=True):
-                hu = {n: v - values[self.scene.names[0]] for n, v in {**values, "core": core}.items()}
-                made = _with(_without_inset(straight[1]), self.grid, partial(self._vessel.painted, values=hu))
+                hu = {
+                    n: v - values[self.scene.names[0]] for n, v in {**values, "core": core}.items()
+                }
+                made = _with(
+                    _without_inset(straight[1]), self.grid, partial(self._vessel.painted, values=hu)
+                )
                 store.keep_scan(made, path)
         present, absent = (Scan.load(p) for p in paths)
         return present, absent
@@ -229,7 +271,9 @@ class VesselTask(Task):
     def shares(self) -> dict[str, Floats]:
         """See :attr:`Task.shares`."""
         own, none = self._vessel.shares(self.grid), np.zeros(self.grid.shape)
-        return {t: sum((own[n] for n in names if n in own), none) for t, names in self._groups.items()}
+        return {
+            t: sum((own[n] for n in names if n in own), none) for t, names in self._groups.items()
+        }
 
     @property
     def _beside(self) -> Floats:
@@ -240,15 +284,19 @@ class VesselTask(Task):
 class _PaintedTask(Task):
     """Tissues of given HU, painted over a patient made of bodies.
 
-    The scene is the patient alone, round about the axis. The tissues are painted over it on voxels half as large as the
-    inset's, projected, and change the patient's counts.
+    The scene is the patient alone, round about the axis. The tissues are painted over it on voxels
+    half as large as the inset's, projected, and change the patient's counts.
     """
 
     def __post_init__(self) -> None:
         both = set(self.tissues_hu) & set(self.scene.names)
         if both or not self.background:
             tissues = ", ".join(self.tissues_hu)
-            why = f"{', '.join(sorted(both))} is a tissue and a body" if both else f"name the background, of {tissues}"
+            why = (
+                f"{', '.join(sorted(both))} is a tissue and a body"
+                if both
+                else f"name the background, of {tissues}"
+            )
             raise ValueError(f"task {self.name}: {why}")
         super().__post_init__()
 
@@ -306,10 +354,21 @@ class _PaintedTask(Task):
         seen = SomeViews(self._alone(store))
         project = Projector(seen.geometry, self.grid, seen.window)
         bodies = self._bodies(seen)
-        maps = {t: project(torch.from_numpy(own).float()) for t, own in self.shares.items() if t != self.patient}
-        values = {**self.tissues_hu, "signal": self._signal_hu, self.patient: self._patient_hu(seen, bodies)}
+        maps = {
+            t: project(torch.from_numpy(own).float())
+            for t, own in self.shares.items()
+            if t != self.patient
+        }
+        values = {
+            **self.tissues_hu,
+            "signal": self._signal_hu,
+            self.patient: self._patient_hu(seen, bodies),
+        }
         bodies[self.patient] = bodies[self.patient] - torch.stack(list(maps.values())).sum(0)
-        ordered = [(maps | bodies)[tissue] for tissue in [*self.shares, *(n for n in bodies if n != self.patient)]]
+        ordered = [
+            (maps | bodies)[tissue]
+            for tissue in [*self.shares, *(n for n in bodies if n != self.patient)]
+        ]
         limit = contrast_limit(seen.information(ordered))
         return Facts(tuple(self.shares), tuple(values[tissue] for tissue in self.shares), limit)
 
@@ -323,14 +382,15 @@ class VoxelTask(_PaintedTask):
     """A segmented lesion of the user's own: labels of voxels, put into a patient made of bodies.
 
     Args:
-        labels: ``(z, y, x)`` whole numbers; 0 and whatever ``tissues`` does not name is the patient. Their middle lies
-            in the middle of the inset; what is beyond the inset is left out.
+        labels: ``(z, y, x)`` whole numbers; 0 and whatever ``tissues`` does not name is the
+            patient. Their middle lies in the middle of the inset; what is beyond the inset is left
+            out.
         spacing: ``(z, y, x)`` of their voxels, mm.
         tissues: name → label and HU on this scanner; signal and background are two of them.
 
     Raises:
-        ValueError: labels that are not whole numbers or of three axes, a label that no voxel has, a name that is a
-            body's, no background.
+        ValueError: labels that are not whole numbers or of three axes, a label that no voxel has, a
+            name that is a body's, no background.
     """
 
     labels: Any = None
@@ -340,14 +400,20 @@ class VoxelTask(_PaintedTask):
     def __post_init__(self) -> None:
         labels = np.asarray(self.labels)
         if labels.ndim != 3 or not np.array_equal(labels, np.round(labels)):
-            raise ValueError(f"task {self.name}: labels must be whole numbers (z, y, x), got shape {labels.shape}")
+            raise ValueError(
+                f"task {self.name}: labels must be whole numbers (z, y, x), got shape "
+                f"{labels.shape}"
+            )
         for tissue, (label, _) in self.tissues.items():
             if not (labels == label).any():
                 raise ValueError(f"task {self.name}: no voxel has the label {label} of {tissue!r}")
         object.__setattr__(self, "labels", labels.astype(np.int64))
         super().__post_init__()
         if len(self.signal) != 1 or not {*self.signal, self.background} <= set(self.tissues):
-            raise ValueError(f"task {self.name}: signal and background must each be one of {', '.join(self.tissues)}")
+            raise ValueError(
+                f"task {self.name}: signal and background must each be one of "
+                f"{', '.join(self.tissues)}"
+            )
 
     @property
     def tissues_hu(self) -> Mapping[str, float]:
@@ -362,13 +428,23 @@ class VoxelTask(_PaintedTask):
 
     def _painted(self, grid: VolumeGrid, values: Mapping[str, float], *, signal: bool) -> Floats:
         hu = dict(values) if signal else {**values, self.signal[0]: values[self.background]}
-        return np.sum([share * hu[tissue] for tissue, share in self._shares_on(grid).items()], axis=0)
+        return np.sum(
+            [share * hu[tissue] for tissue, share in self._shares_on(grid).items()], axis=0
+        )
 
     def _shares_on(self, grid: VolumeGrid) -> dict[str, Floats]:
         """Tissue → its share of every voxel of a grid, exactly."""
-        along = [overlap(VolumeGrid(self.labels.shape, self.spacing, self.grid.center), grid, a) for a in range(3)]
+        along = [
+            overlap(VolumeGrid(self.labels.shape, self.spacing, self.grid.center), grid, a)
+            for a in range(3)
+        ]
         return {
-            tissue: np.einsum("iz,jy,kx,zyx->ijk", *along, (self.labels == label).astype(np.float64), optimize=True)
+            tissue: np.einsum(
+                "iz,jy,kx,zyx->ijk",
+                *along,
+                (self.labels == label).astype(np.float64),
+                optimize=True,
+            )
             for tissue, (label, _) in self.tissues.items()
         }
 
@@ -376,7 +452,12 @@ class VoxelTask(_PaintedTask):
     def shares(self) -> dict[str, Floats]:
         """See :attr:`Task.shares`."""
         own = self._shares_on(self.grid)
-        order = {("signal" if n in self.signal else n): own[n] for ns in self._groups.values() for n in ns if n in own}
+        order = {
+            ("signal" if n in self.signal else n): own[n]
+            for ns in self._groups.values()
+            for n in ns
+            if n in own
+        }
         return {**order, self.patient: 1.0 - np.sum(list(own.values()), axis=0)}
 
 
@@ -384,15 +465,16 @@ class VoxelTask(_PaintedTask):
 class AnatomyTask(_PaintedTask):
     """A vessel that breaks assumptions, in a patient made of bodies.
 
-    The signal is the anatomy's feature; without it there is what the anatomy has in its place, which may be several
-    tissues. It is read in the voxels that it changes by more than half of what it changes at most, thin as it may be.
+    The signal is the anatomy's feature; without it there is what the anatomy has in its place,
+    which may be several tissues. It is read in the voxels that it changes by more than half of what
+    it changes at most, thin as it may be.
 
     Args:
         anatomy: a name of :data:`recon.evaluate.anatomies.ANATOMIES`.
 
     Raises:
-        ValueError: another signal than ``"feature"``, a background that is neither a tissue of the anatomy's base nor
-            the patient.
+        ValueError: another signal than ``"feature"``, a background that is neither a tissue of the
+            anatomy's base nor the patient.
     """
 
     anatomy: str = "healthy"
@@ -402,7 +484,8 @@ class AnatomyTask(_PaintedTask):
         grounds = [*dict.fromkeys(part.tissue for part in self._what.base), self.patient]
         if self.signal != (_FEATURE,) or self.background not in grounds:
             raise ValueError(
-                f"task {self.name}: of an anatomy the signal is {_FEATURE!r} and the background one of "
+                f"task {self.name}: of an anatomy the signal is {_FEATURE!r} and the background "
+                "one of "
                 f"{', '.join(grounds)}, got {', '.join(self.signal)} and {self.background!r}"
             )
 
@@ -412,7 +495,8 @@ class AnatomyTask(_PaintedTask):
 
     @property
     def tissues_hu(self) -> Mapping[str, float]:
-        """HU of all tissues but the patient's, which is the anatomy's fat; the feature's is the mean over it."""
+        """HU of all tissues but the patient's, which is the anatomy's fat; the feature's is the
+        mean over it."""
         tissues = {t: hu for t, hu in self._what.values.items() if t != _FAT}
         return {_FEATURE: 0.0, **tissues}
 
@@ -426,17 +510,27 @@ class AnatomyTask(_PaintedTask):
 
     @property
     def _signal_hu(self) -> float:
-        changed = {pair: float(own.sum()) for pair, own in self._changes.items() if pair[0] != pair[1]}
-        return sum(self._what.values[pair[0]] * size for pair, size in changed.items()) / sum(changed.values())
+        changed = {
+            pair: float(own.sum()) for pair, own in self._changes.items() if pair[0] != pair[1]
+        }
+        return sum(self._what.values[pair[0]] * size for pair, size in changed.items()) / sum(
+            changed.values()
+        )
 
     @cached_property
     def shares(self) -> dict[str, Floats]:
         """See :attr:`Task.shares`."""
-        signal = np.sum([own for (after, before), own in self._changes.items() if after != before], axis=0)
+        signal = np.sum(
+            [own for (after, before), own in self._changes.items() if after != before], axis=0
+        )
         kept = {t: self._changes.get((t, t), np.zeros(self.grid.shape)) for t in self._what.values}
         kept[self.patient] = kept.pop(_FAT)
         background = kept.pop(self.background)
-        return {"signal": signal, self.background: background, **{t: own for t, own in kept.items() if own.any()}}
+        return {
+            "signal": signal,
+            self.background: background,
+            **{t: own for t, own in kept.items() if own.any()},
+        }
 
     def truth(self, facts: Facts) -> tuple[Tensor, Tensor]:
         """See :meth:`Task.truth`."""
@@ -462,19 +556,24 @@ class AnatomyTask(_PaintedTask):
 
     @property
     def _rest(self) -> Floats:
-        """Fat, and muscle as far as there is any: the vessel alone is looked at, whatever it lies on."""
+        """Fat, and muscle as far as there is any: the vessel alone is looked at, whatever it
+        lies on."""
         return self.shares[self.patient] + self.shares.get("muscle", 0.0)
 
     @property
     def _around(self) -> NDArray[np.bool_]:
         """Of the background, so far from the signal that its blur does not reach there."""
-        away = ndimage.distance_transform_edt(self.shares["signal"] == 0.0, sampling=self.grid.spacing)
+        away = ndimage.distance_transform_edt(
+            self.shares["signal"] == 0.0, sampling=self.grid.spacing
+        )
         return self._pure(self.background, np.where(away > BESIDE_MM, self._beside, 0.0))
 
 
 def _about_middle(grid: VolumeGrid, inset: VolumeGrid) -> VolumeGrid:
     """A grid in the coordinates about the inset's middle."""
-    return replace(grid, center=tuple(a - b for a, b in zip(grid.center, inset.center, strict=True)))
+    return replace(
+        grid, center=tuple(a - b for a, b in zip(grid.center, inset.center, strict=True))
+    )
 
 
 def _without_inset(scan: Scan) -> Scan:
@@ -485,11 +584,14 @@ def _without_inset(scan: Scan) -> Scan:
 
 
 def _with(scan: Scan, inset: VolumeGrid, painted: Callable[[VolumeGrid], Floats]) -> Scan:
-    """A noise-free scan, and in its inset the HU that are painted on a grid of half its voxels added."""
+    """A noise-free scan, and in its inset the HU that are painted on a grid of half its voxels
+    added."""
     fine = VolumeGrid(tuple(2 * n for n in inset.shape), inset.spacing[0] / 2, inset.center)
     mu = torch.from_numpy(painted(fine) * (scan.linearisation.mu_ref / 1000.0)).float()
     added = Projector(scan.geometry, fine, scan.window)(mu)
     p = scan._at_window(scan.air.log()) - scan.counts.log()
     # One Newton step of the linearisation: what is added is a few per cent of what is there.
     half = p + 0.5 * added / scan.linearisation.slope(p, scan.window)
-    return replace(scan, counts=scan.counts * (-added / scan.linearisation.slope(half, scan.window)).exp())
+    return replace(
+        scan, counts=scan.counts * (-added / scan.linearisation.slope(half, scan.window)).exp()
+    )

@@ -1,9 +1,10 @@
 """The paper's plaque on a vessel of any direction: tilted, in plane, curved, bifurcating.
 
-The analytic scenes know vessels along z only. Here a point of space is taken to the vessel's own coordinates (across
-towards the plaque, across, along the centreline) and there asked which tissue of the straight plaque it lies in. So all
-vessels have the same sections. The plaque sits across the plane of a bend, where bending neither stretches nor squeezes
-it on average: every tissue keeps its volume exactly (Pappus), as its sections are symmetric about that plane.
+The analytic scenes know vessels along z only. Here a point of space is taken to the vessel's own
+coordinates (across towards the plaque, across, along the centreline) and there asked which tissue
+of the straight plaque it lies in. So all vessels have the same sections. The plaque sits across the
+plane of a bend, where bending neither stretches nor squeezes it on average: every tissue keeps its
+volume exactly (Pappus), as its sections are symmetric about that plane.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ __all__ = ["LENGTH_MM", "SHAPES", "Branch", "Centreline", "Vessel"]
 Floats = NDArray[np.float64]
 
 LENGTH_MM = 8.0
-"""Of every vessel, along its centreline: in any direction it ends inside of the inset, 9 mm wide."""
+"""Of every vessel, along its centreline: in any direction it ends inside of the inset, 9 mm
+wide."""
 
 _PLAQUE = Plaque(position=(0.0, 0.0, 0.0), vessel_length=LENGTH_MM)
 
@@ -41,7 +43,8 @@ class Centreline:
         radius: of the arc in mm, which bends towards ``tangent × side``; ``inf`` for a line.
 
     Raises:
-        ValueError: vectors that are not of unit length and perpendicular, a radius that is not positive.
+        ValueError: vectors that are not of unit length and perpendicular, a radius that is not
+            positive.
     """
 
     tangent: tuple[float, float, float]
@@ -51,7 +54,10 @@ class Centreline:
     def __post_init__(self) -> None:
         frame = np.stack([self.side, self.tangent])
         if not np.allclose(frame @ frame.T, np.eye(2)):
-            raise ValueError(f"tangent and side must be perpendicular unit vectors, got {self.tangent}, {self.side}")
+            raise ValueError(
+                f"tangent and side must be perpendicular unit vectors, got {self.tangent}, "
+                f"{self.side}"
+            )
         if not self.radius > 0:
             raise ValueError(f"radius must be positive, got {self.radius} mm")
 
@@ -62,7 +68,10 @@ class Centreline:
         if math.isinf(self.radius):
             return np.stack([towards, across, along], axis=-1)
         left = self.radius - across
-        return np.stack([towards, self.radius - np.hypot(along, left), self.radius * np.arctan2(along, left)], axis=-1)
+        return np.stack(
+            [towards, self.radius - np.hypot(along, left), self.radius * np.arctan2(along, left)],
+            axis=-1,
+        )
 
     def point(self, local: ArrayLike) -> Floats:
         """The inverse of :meth:`local`."""
@@ -70,7 +79,9 @@ class Centreline:
         if not math.isinf(self.radius):
             angle, distance = along / self.radius, self.radius - across
             across, along = self.radius - distance * np.cos(angle), distance * np.sin(angle)
-        result: Floats = np.stack([towards, across, along], axis=-1) @ np.asarray(self.axes, np.float64)
+        result: Floats = np.stack([towards, across, along], axis=-1) @ np.asarray(
+            self.axes, np.float64
+        )
         return result
 
     @property
@@ -148,11 +159,15 @@ class Vessel:
     def painted(self, grid: VolumeGrid, values: Mapping[str, float]) -> Floats:
         """Mean over each voxel ``grid.shape`` of ``values`` of the tissues; of other tissues 0."""
         shares = self.shares(grid)
-        result: Floats = np.tensordot([values.get(n, 0.0) for n in shares], list(shares.values()), axes=1)
+        result: Floats = np.tensordot(
+            [values.get(n, 0.0) for n in shares], list(shares.values()), axes=1
+        )
         return result
 
 
-_X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+_X = (1.0, 0.0, 0.0)
+_Y = (0.0, 1.0, 0.0)
+_Z = (0.0, 0.0, 1.0)
 _HALF = math.sqrt(0.5)
 
 SHAPES: dict[str, tuple[Centreline, Branch | None]] = {
@@ -164,4 +179,5 @@ SHAPES: dict[str, tuple[Centreline, Branch | None]] = {
     "curved_5mm": (Centreline(_Z, _X, 5.0), None),
     "bifurcating": (Centreline(_Z, _X), Branch()),
 }
-"""Centreline and side branch of every vessel; ``in_plane_x`` is ``in_plane_y`` turned by a right angle about z."""
+"""Centreline and side branch of every vessel; ``in_plane_x`` is ``in_plane_y`` turned by a right
+angle about z."""

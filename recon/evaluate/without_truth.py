@@ -1,13 +1,14 @@
-"""Methods on measured data, where nobody knows the truth: two scans of one object, or one scan in two halves.
+"""Methods on measured data, where nobody knows the truth: two scans of one object, or one scan in
+two halves.
 
-What two independent scans agree on is signal, what they do not is noise. A blur buys low noise with resolution, so the
-reference is filtered to each method's resolution, in the plane and along z, before noise is compared
-(:mod:`torchpcct.metrics.equal_resolution`): the dose factor is the ratio of the variances then, in a region that the
-user knows to be flat, or over all.
+What two independent scans agree on is signal, what they do not is noise. A blur buys low noise with
+resolution, so the reference is filtered to each method's resolution, in the plane and along z,
+before noise is compared (:mod:`torchpcct.metrics.equal_resolution`): the dose factor is the ratio
+of the variances then, in a region that the user knows to be flat, or over all.
 
-FBP takes samples: on voxels coarser than the detector's cells it aliases noise, the more the sharper its kernel. Then
-every smoother kernel seems to save dose. FBP of scans is therefore made on voxels as fine as the cells, and what the
-coarse ones cannot show is left out.
+FBP takes samples: on voxels coarser than the detector's cells it aliases noise, the more the
+sharper its kernel. Then every smoother kernel seems to save dose. FBP of scans is therefore made on
+voxels as fine as the cells, and what the coarse ones cannot show is left out.
 """
 
 from __future__ import annotations
@@ -58,7 +59,9 @@ class MeasuredDraw:
     @property
     def label(self) -> str:
         """Measured scans have no volumes in files."""
-        raise ValueError("files:FOLDER holds volumes of exported scans: for measured ones use evaluate_volumes")
+        raise ValueError(
+            "files:FOLDER holds volumes of exported scans: for measured ones use evaluate_volumes"
+        )
 
     @property
     def exposure_s(self) -> float:
@@ -88,45 +91,61 @@ class MeasuredDraw:
 def evaluate_scans(
     scans: Any, grid: VolumeGrid, methods: Any, region: Any = None, *, n: int = 1, seed: int = 0
 ) -> list[Record]:
-    """Methods on two scans of one object, or on one scan of the whole detector in two halves of its views.
+    """Methods on two scans of one object, or on one scan of the whole detector in two halves of its
+    views.
 
     Args:
         scans: two with the same geometry, or one.
         grid: of the volumes.
         methods: as for :func:`recon.evaluate.experiment`, without files.
         region: bool mask ``grid.shape`` where noise is measured; None: everywhere.
-        n: pairs of noise realisations that are measured. The first is the two scans as they are; for each further one
-            views drawn at random are exchanged between them, which makes two other scans with independent noise.
+        n: pairs of noise realisations that are measured. The first is the two scans as they are;
+            for each further one views drawn at random are exchanged between them, which makes two
+            other scans with independent noise.
         seed: of that draw.
 
     Returns:
-        What :func:`evaluate_volumes` gives, for a dose of ONE of the scans; of ``n`` pairs the geometric means. Where
-        the voxels are coarser than the detector's cells at the axis, FBP is made on finer ones and resampled without
-        aliasing, and ``note`` says so: its noise is less than that of :func:`recon.reconstruct` on the coarse voxels.
+        What :func:`evaluate_volumes` gives, for a dose of ONE of the scans; of ``n`` pairs the
+        geometric means. Where the voxels are coarser than the detector's cells at the axis, FBP is
+        made on finer ones and resampled without aliasing, and ``note`` says so: its noise is less
+        than that of :func:`recon.reconstruct` on the coarse voxels.
 
     Raises:
-        ValueError, TypeError: no two scans of one kind; ``n`` > 1 of one scan, whose halves have no views in common;
-            what the methods refuse.
+        ValueError, TypeError: no two scans of one kind; ``n`` > 1 of one scan, whose halves have no
+            views in common; what the methods refuse.
     """
     given: Sequence[Scan] = [scans] if isinstance(scans, Scan) else list(scans)
     n, seed = whole("n", n, 1), whole("seed", seed, 0)
     if len(given) == 1:
         if n > 1:
-            raise ValueError(f"n = {n} pairs are made of two scans by exchanging views: one scan makes one pair")
+            raise ValueError(
+                f"n = {n} pairs are made of two scans by exchanging views: one scan makes one pair"
+            )
         given = halves(given[0])
     if len(given) != 2 or any(not isinstance(s, Scan) for s in given):
         raise ValueError(f"give one scan, or two of the same object, got {len(given)}")
     if given[0].counts.shape != given[1].counts.shape:
         raise ValueError(
-            f"the scans have {tuple(given[0].counts.shape)} and {tuple(given[1].counts.shape)} readings: two scans of "
+            f"the scans have {tuple(given[0].counts.shape)} and {tuple(given[1].counts.shape)} "
+            "readings: two scans of "
             "one object by one scanner are needed"
         )
     if n > 1 and given[0].geometry != given[1].geometry:
-        raise ValueError("views can be exchanged between scans of one geometry only: these have two; leave out n")
-    if n > 1 and abs(math.log(float(given[0].air.double().mean() / given[1].air.double().mean()))) > _SAME_LIGHT:
-        raise ValueError("views can be exchanged between scans of one exposure only: these have two; leave out n")
+        raise ValueError(
+            "views can be exchanged between scans of one geometry only: these have two; leave out n"
+        )
+    if (
+        n > 1
+        and abs(math.log(float(given[0].air.double().mean() / given[1].air.double().mean())))
+        > _SAME_LIGHT
+    ):
+        raise ValueError(
+            "views can be exchanged between scans of one exposure only: these have two; leave out n"
+        )
     if grid.ndim == 2:  # filters work on volumes
-        given = [replace(s, air=s.air[None], **s.each(lambda readings: readings[None])) for s in given]
+        given = [
+            replace(s, air=s.air[None], **s.each(lambda readings: readings[None])) for s in given
+        ]
         grid = VolumeGrid((1, *grid.shape), (grid.spacing[0], *grid.spacing), (0.0, *grid.center))
     names = [method_of(m) for m in (methods if isinstance(methods, list | tuple) else [methods])]
     draw = np.random.default_rng(seed)
@@ -148,8 +167,16 @@ def _exchanged(pair: Sequence[Scan], draw: np.random.Generator) -> list[Scan]:
 
     def mixed(a: Scan, b: Scan) -> Scan:
         fields: dict[str, Any] = {}
-        missing = {"dead": torch.zeros_like(a.counts, dtype=torch.bool), "flux": torch.ones(a.geometry.views)}
-        for name, of_views in (("counts", other), ("quantum", other), ("dead", other), ("flux", views)):
+        missing = {
+            "dead": torch.zeros_like(a.counts, dtype=torch.bool),
+            "flux": torch.ones(a.geometry.views),
+        }
+        for name, of_views in (
+            ("counts", other),
+            ("quantum", other),
+            ("dead", other),
+            ("flux", views),
+        ):
             ours, theirs = getattr(a, name), getattr(b, name)
             if ours is not None or theirs is not None:
                 ours, theirs = (missing[name] if v is None else v for v in (ours, theirs))
@@ -167,7 +194,9 @@ def _reconstructed(
 
     def volumes(method: Method) -> list[Tensor]:
         if method.name not in kept:
-            kept[method.name] = [volume_of(method, MeasuredDraw(scan, grid, noise)) for scan in pair]
+            kept[method.name] = [
+                volume_of(method, MeasuredDraw(scan, grid, noise)) for scan in pair
+            ]
         return kept[method.name]
 
     def noise(method: Method, smooths: float) -> float:
@@ -178,13 +207,17 @@ def _reconstructed(
 
 
 def _finer(scan: Scan, grid: VolumeGrid) -> list[int]:
-    """Parts an axis into which the voxels are cut, so that none is coarser than the detector's cells."""
+    """Parts an axis into which the voxels are cut, so that none is coarser than the detector's
+    cells."""
     cells = cells_at_axis(scan.geometry)[-grid.ndim :]
-    return [max(1, math.ceil(s / (_COARSE * cell))) for s, cell in zip(grid.spacing, cells, strict=True)]
+    return [
+        max(1, math.ceil(s / (_COARSE * cell))) for s, cell in zip(grid.spacing, cells, strict=True)
+    ]
 
 
 def _unaliased(scan: Scan, grid: VolumeGrid, kernel: str) -> Tensor:
-    """FBP on voxels as fine as the detector's cells, of which the frequencies that the grid shows are kept.
+    """FBP on voxels as fine as the detector's cells, of which the frequencies that the grid shows
+    are kept.
 
     Cosines over all of the grid, sampled at the centres of its voxels, are those of the finer one.
     """
@@ -211,26 +244,41 @@ def _note(scan: Scan, grid: VolumeGrid) -> str:
         return ""
 
     cells = finite_cells(scan.geometry)
-    voxels, fine = grid.spacing[-len(cells) :], [s / k for s, k in zip(grid.spacing, parts, strict=True)][-len(cells) :]
+    voxels, fine = (
+        grid.spacing[-len(cells) :],
+        [s / k for s, k in zip(grid.spacing, parts, strict=True)][-len(cells) :],
+    )
     return (
-        f"voxels of {_lengths(voxels)} mm are coarser than the detector's cells, {_lengths(cells)} mm at the axis, and "
-        f"FBP on them aliases noise. FBP, {_REFERENCE} too, was therefore reconstructed on voxels of {_lengths(fine)} "
-        "mm and resampled without aliasing, also as the base of denoisers: its noise is less than on the coarse voxels"
+        f"voxels of {_lengths(voxels)} mm are coarser than the detector's cells, "
+        f"{_lengths(cells)} mm at the axis, and "
+        f"FBP on them aliases noise. FBP, {_REFERENCE} too, was therefore reconstructed on voxels "
+        f"of {_lengths(fine)} "
+        "mm and resampled without aliasing, also as the base of denoisers: its noise is less than "
+        "on the coarse voxels"
     )
 
 
 def _mean(rows: list[Record]) -> Record:
-    """Of one method on several pairs: geometric means, without those of which nothing can be said."""
+    """Of one method on several pairs: geometric means, without those of which nothing can be
+    said."""
     sound = [r for r in rows if not r["why"]]
     if not sound:
         return rows[0]
     keys = ("noise", "noise_shared", "noise_reference", "dose_factor", "low", "high")
-    return {**sound[0], **{k: math.exp(float(np.mean([math.log(r[k]) for r in sound]))) for k in keys}}
+    return {
+        **sound[0],
+        **{k: math.exp(float(np.mean([math.log(r[k]) for r in sound]))) for k in keys},
+    }
 
 
 @checked
 def evaluate_volumes(
-    volumes: Any, reference: Any, voxel_mm: Any, region: Any = None, *, cells_mm: Sequence[float] | None = None
+    volumes: Any,
+    reference: Any,
+    voxel_mm: Any,
+    region: Any = None,
+    *,
+    cells_mm: Sequence[float] | None = None,
 ) -> list[Record]:
     """Noise, resolution and the dose factor of noise at equal resolution of pairs of volumes.
 
@@ -238,17 +286,22 @@ def evaluate_volumes(
         volumes: method → its two volumes ``(z, y, x)`` or ``(y, x)`` in one unit.
         reference: the two of a linear method that has smoothed nothing (FBP, kernel "ram-lak").
         voxel_mm: edge length of the voxels, one or ``(z, y, x)``.
-        region: bool mask of a volume where noise is measured; resolution is that of the whole volume. None: everywhere.
+        region: bool mask of a volume where noise is measured; resolution is that of the whole
+            volume. None: everywhere.
         cells_mm: of the detector as they are seen at the axis, ([z,] y, x), in mm; None: not known.
 
     Returns:
-        For each method: ``method``; ``noise`` of a voxel of one volume; ``noise_shared``, the same at the frequencies
-        that the reference's two volumes agree on; ``noise_reference``: of the reference there, as sharp as the method;
-        ``dose_factor``: the ratio of the last two variances, ``low`` and ``high`` its 95 % interval; ``f50`` and
-        ``f50_z``, line pairs per mm in the plane and along z at which half of the reference's signal is left (inf: it
-        does not fall so far as the object shows); ``resolution`` and ``resolution_z``, up to which the reference's
-        volumes agree; ``why`` there is no factor, which then is NaN (else empty); ``note``: on what the factors depend,
-        as the voxels of the reference must not be coarser than the detector's cells (empty: they are not).
+        For each method: ``method``; ``noise`` of a voxel of one volume; ``noise_shared``, the same
+            at the frequencies
+        that the reference's two volumes agree on; ``noise_reference``: of the reference there, as
+        sharp as the method;
+        ``dose_factor``: the ratio of the last two variances, ``low`` and ``high`` its 95 %
+            interval; ``f50`` and
+        ``f50_z``, line pairs per mm in the plane and along z at which half of the reference's
+        signal is left (inf: it does not fall so far as the object shows); ``resolution`` and
+        ``resolution_z``, up to which the reference's volumes agree; ``why`` there is no factor,
+        which then is NaN (else empty); ``note``: on what the factors depend, as the voxels of the
+        reference must not be coarser than the detector's cells (empty: they are not).
 
     Raises:
         ValueError: volumes of other shapes, NaN; constant ones, or two that are the same.
@@ -262,19 +315,31 @@ def evaluate_volumes(
         split = _split(name, pair)
         if split.first.shape != base.first.shape:
             raise ValueError(
-                f"{name} has volumes of shape {tuple(split.first.shape)}, the reference {tuple(base.first.shape)}"
+                f"{name} has volumes of shape {tuple(split.first.shape)}, the reference "
+                f"{tuple(base.first.shape)}"
             )
         try:
             seen = noise_at_equal_resolution(split, base, tuple(spacing), mask)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error
         factor = seen.dose_factor
-        found.append({
-            "method": name, "noise": seen.noise, "noise_shared": seen.noise_shared,
-            "noise_reference": seen.noise_reference, "dose_factor": factor.value, "low": factor.low,
-            "high": factor.high, "f50": seen.f50_plane, "f50_z": seen.f50_z, "resolution": seen.shown_plane,
-            "resolution_z": seen.shown_z, "why": seen.why, "note": note,
-        })  # fmt: skip
+        found.append(
+            {
+                "method": name,
+                "noise": seen.noise,
+                "noise_shared": seen.noise_shared,
+                "noise_reference": seen.noise_reference,
+                "dose_factor": factor.value,
+                "low": factor.low,
+                "high": factor.high,
+                "f50": seen.f50_plane,
+                "f50_z": seen.f50_z,
+                "resolution": seen.shown_plane,
+                "resolution_z": seen.shown_z,
+                "why": seen.why,
+                "note": note,
+            }
+        )
     return found
 
 
@@ -283,23 +348,30 @@ def _condition(spacing: Sequence[float], cells: Sequence[float] | None) -> str:
     if cells is None:
         return (
             "it is taken that the detector's cells at the axis are no smaller than the voxels, "
-            f"{max(spacing[1:]):.3g} mm in the plane: on coarser voxels FBP aliases noise, and every smoother method "
+            f"{max(spacing[1:]):.3g} mm in the plane: on coarser voxels FBP aliases noise, and "
+            "every smoother method "
             "seems to save dose"
         )
     voxels = spacing[-len(cells) :]
     if all(s <= _COARSE * cell for s, cell in zip(voxels, cells, strict=True)):
         return ""
     return (
-        f"these factors are not to be trusted: the voxels of {_lengths(voxels)} mm are coarser than the detector's "
-        f"cells, {_lengths(cells)} mm at the axis, so FBP aliases noise and every smoother method seems to save dose; "
-        "give a reference on voxels no coarser than the cells or averaged from such, or the scans (--scans)"
+        f"these factors are not to be trusted: the voxels of {_lengths(voxels)} mm are coarser "
+        "than the detector's "
+        f"cells, {_lengths(cells)} mm at the axis, so FBP aliases noise and every smoother method "
+        "seems to save dose; "
+        "give a reference on voxels no coarser than the cells or averaged from such, or the scans "
+        "(--scans)"
     )
 
 
 def _split(name: str, pair: Any) -> HalfSplit:
     first, second = (torch.as_tensor(np.asarray(v)).double() for v in pair)
     if first.shape != second.shape or first.ndim not in (2, 3):
-        raise ValueError(f"{name}: two volumes (z, y, x) of one shape are needed, got {first.shape} and {second.shape}")
+        raise ValueError(
+            f"{name}: two volumes (z, y, x) of one shape are needed, got {first.shape} and "
+            f"{second.shape}"
+        )
     if not (torch.isfinite(first).all() and torch.isfinite(second).all()):
         raise ValueError(f"{name}: a volume holds NaN or Inf")
     shape = (1, *first.shape)[-3:]

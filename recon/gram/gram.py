@@ -1,19 +1,22 @@
-"""AᵀWA of a small inset by FFT: fast enough for hundreds of applications, close enough to correct exactly.
+"""AᵀWA of a small inset by FFT: fast enough for hundreds of applications, close enough to correct
+exactly.
 
-For an inset much smaller than its distance to the source, AᵀWA is nearly shift invariant in the plane: FFT in (y, x),
-a banded matrix along z for every frequency (see :mod:`recon.gram.impulse_response`). Its slow change across the inset
-(path lengths, bowtie, magnification) is taken to first or second order in position at the midpoint of the two voxels:
+For an inset much smaller than its distance to the source, AᵀWA is nearly shift invariant in the
+plane: FFT in (y, x), a banded matrix along z for every frequency (see
+:mod:`recon.gram.impulse_response`). Its slow change across the inset (path lengths, bowtie,
+magnification) is taken to first or second order in position at the midpoint of the two voxels:
 
     G x = K₀x + ½ Σ_c [ b_c · (K_c x) + K_c (b_c · x) ],      b = y, x (, y², yx, x²),
 
-with the K_c fitted to exact impulse responses at a few nodes. The form is self-adjoint. What it cannot hold is the
-irregular beat of the voxel lattice with the detector's cells: 2–3 % on white noise at 0.2 mm voxels, 0.1 % on tissue
-shapes. It is a model: who needs the exact operator removes its error with exact projections.
+with the K_c fitted to exact impulse responses at a few nodes. The form is self-adjoint. What it
+cannot hold is the irregular beat of the voxel lattice with the detector's cells: 2–3 % on white
+noise at 0.2 mm voxels, 0.1 % on tissue shapes. It is a model: who needs the exact operator removes
+its error with exact projections.
 
-Exact impulse responses carry that beat: the fitted spectrum is indefinite at some frequencies, which would let a weakly
-regularised solution escape there, so :func:`make_definite` changes it. Low frequencies are left as they are
-(``LOW``): what makes them indefinite is that the square of lags is cut off, and that harms nobody on the grid
-itself, whereas tissues have most of their energy there.
+Exact impulse responses carry that beat: the fitted spectrum is indefinite at some frequencies,
+which would let a weakly regularised solution escape there, so :func:`make_definite` changes it. Low
+frequencies are left as they are (``LOW``): what makes them indefinite is that the square of lags is
+cut off, and that harms nobody on the grid itself, whereas tissues have most of their energy there.
 """
 
 from __future__ import annotations
@@ -34,52 +37,76 @@ from torchpcct.switches import undisturbed
 from torchpcct.threads import run
 from torchpcct.validate import number
 
-__all__ = ["REFERENCE_FREQUENCY", "Gram", "check_weights", "cholesky", "information_at", "make_definite"]
+__all__ = [
+    "REFERENCE_FREQUENCY",
+    "Gram",
+    "check_weights",
+    "cholesky",
+    "information_at",
+    "make_definite",
+]
 
-# Frequencies in plane that are not made definite, in steps of the padded grid's, and at most in periods per voxel. With
-# them changed as well, the error on a vessel was 0.25 % (1968 views of the paper's scan), 1.7 % (360 views) and 2.7 %
-# (40° of those missing), without 0.1 % each, and the least eigenvalue on the grid is the same.
-LOW, LOW_PER_VOXEL = 6.0, 0.06
+# Frequencies in plane that are not made definite, in steps of the padded grid's, and at most in
+# periods per voxel. With them changed as well, the error on a vessel was 0.25 % (1968 views of the
+# paper's scan), 1.7 % (360 views) and 2.7 % (40° of those missing), without 0.1 % each, and the
+# least eigenvalue on the grid is the same.
+LOW = 6.0
+LOW_PER_VOXEL = 0.06
 # Smallest pivot, as a share of the diagonal, that a definite spectrum must have.
 LEAST_PIVOT = 1e-4
-# Stiffness added between two neighbouring slices at a time, as a share of the mean diagonal, and how often per
-# frequency. Indefinite modes alternate from slice to slice, so this leaves objects that are smooth along z alone.
-STIFFNESS, ADDITIONS = 2e-2, 600
-# Where that does not help: shares of the position-dependent terms that are kept, then shifts of the diagonal.
+# Stiffness added between two neighbouring slices at a time, as a share of the mean diagonal, and
+# how often per frequency. Indefinite modes alternate from slice to slice, so this leaves objects
+# that are smooth along z alone.
+STIFFNESS = 2e-2
+ADDITIONS = 600
+# Where that does not help: shares of the position-dependent terms that are kept, then shifts of the
+# diagonal.
 KEPT = (0.5, 0.2, 0.0)
 SHIFTS = (3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0, 3.0)
 
 
 def cholesky(kernel: Tensor) -> tuple[Tensor, NDArray[np.bool_]]:
-    """Banded L with L Lᴴ = kernel, ``(reach + 1, nz, ...)``, and where the kernel is positive definite, ``(...)``."""
+    """Banded L with L Lᴴ = kernel, ``(reach + 1, nz, ...)``, and where the kernel is positive
+    definite, ``(...)``."""
     from recon.gram.kernels import banded_cholesky  # numba loads with its first use
 
     if kernel.ndim < 2 or kernel.shape[0] > max(kernel.shape[1], 1):
-        raise ValueError(f"kernel must be (reach + 1, nz, ...) with reach < nz, got the shape {tuple(kernel.shape)}")
+        raise ValueError(
+            "kernel must be (reach + 1, nz, ...) with reach < nz, got the shape "
+            f"{tuple(kernel.shape)}"
+        )
     flat = kernel.cpu().reshape(*kernel.shape[:2], -1).to(torch.complex128).contiguous().numpy()
     lower = np.zeros_like(flat)
     definite = np.zeros(flat.shape[2], dtype=np.bool_)
     work = 4 * lower[..., 0].size * len(lower)
     run(banded_cholesky, definite.size, flat, LEAST_PIVOT, lower, definite, operations=work)
-    return torch.from_numpy(lower).reshape(kernel.shape).to(kernel), definite.reshape(tuple(kernel.shape[2:]))
+    return torch.from_numpy(lower).reshape(kernel.shape).to(kernel), definite.reshape(
+        tuple(kernel.shape[2:])
+    )
 
 
 def make_definite(spectra: Tensor) -> Tensor:
     """Shift and damp spectra as little as needed.
 
     Args:
-        spectra: ``(terms, reach + 1, nz, fy, fx)`` complex lower bands of K_c; terms 1, 3 (y, x) or 6 (… y², yx, x²).
+        spectra: ``(terms, reach + 1, nz, fy, fx)`` complex lower bands of K_c; terms 1, 3 (y, x) or
+            6 (… y², yx, x²).
 
     Returns:
-        Spectra of the same shape for which Σ_c b_c K_c is positive definite at the centre, the corners and the edge
-        midpoints of the grid, b_c ∈ monomials of y, x ∈ {−1, 0, 1}.
+        Spectra of the same shape for which Σ_c b_c K_c is positive definite at the centre, the
+        corners and the edge midpoints of the grid, b_c ∈ monomials of y, x ∈ {−1, 0, 1}.
 
     Raises:
         ValueError: another shape.
     """
-    if spectra.ndim != 5 or spectra.shape[0] not in (1, 3, 6) or spectra.shape[1] > spectra.shape[2]:
+    if (
+        spectra.ndim != 5
+        or spectra.shape[0] not in (1, 3, 6)
+        or spectra.shape[1] > spectra.shape[2]
+    ):
         raise ValueError(
-            "spectra must be (terms, reach + 1, nz, fy, fx) of 1, 3 or 6 terms and reach < nz, got the shape "
+            "spectra must be (terms, reach + 1, nz, fy, fx) of 1, 3 or 6 terms and reach < nz, "
+            "got the shape "
             f"{tuple(spectra.shape)}"
         )
     terms, bands, nz = spectra.shape[:3]
@@ -95,24 +122,41 @@ def make_definite(spectra: Tensor) -> Tensor:
     flat[..., todo] = plain[..., todo]
     kept = np.array(KEPT if terms > 1 else ())
     least = 1e-9 * level.max()
-    run(damp, todo.size, flat, _points(terms), LEAST_PIVOT, kept, np.array(SHIFTS), level, least, todo)
+    run(
+        damp,
+        todo.size,
+        flat,
+        _points(terms),
+        LEAST_PIVOT,
+        kept,
+        np.array(SHIFTS),
+        level,
+        least,
+        todo,
+    )
     return torch.from_numpy(flat).reshape(spectra.shape).to(spectra)
 
 
 def _points(terms: int) -> NDArray[np.float64]:
-    """Polynomials b_c at the centre, the corners and the edge midpoints of the grid, ``(points, terms)``."""
+    """Polynomials b_c at the centre, the corners and the edge midpoints of the grid, ``(points,
+    terms)``."""
     at = (-1, 0, 1) if terms > 1 else (0,)
-    return np.array([[1, y, x, y * y, y * x, x * x][:terms] for y in at for x in at], dtype=np.float64)
+    return np.array(
+        [[1, y, x, y * y, y * x, x * x][:terms] for y in at for x in at], dtype=np.float64
+    )
 
 
 # Bands along z whose energy is below this share of the kernel's are dropped (float32 rounding).
 BAND_ENERGY = 1e-13
-# Usual frequency of `information`, line pairs per mm, and the share of it by which others are still averaged over.
-REFERENCE_FREQUENCY, AROUND = 0.5, 0.2
-# Highest frequency per voxel that is looked at: beyond, the corners of the voxels' own spectrum say little, and may be
-# negative.
+# Usual frequency of `information`, line pairs per mm, and the share of it by which others are still
+# averaged over.
+REFERENCE_FREQUENCY = 0.5
+AROUND = 0.2
+# Highest frequency per voxel that is looked at: beyond, the corners of the voxels' own spectrum say
+# little, and may be negative.
 HIGHEST_PER_VOXEL = 0.25
-# Of the information that a voxel's own response stands for: less is rounding, or cut off with the grid.
+# Of the information that a voxel's own response stands for: less is rounding, or cut off with the
+# grid.
 LEAST_INFORMATION = 0.1
 
 
@@ -120,15 +164,18 @@ class Gram:
     """A fast, self-adjoint model of x ↦ AᵀW A x on an inset.
 
     Args:
-        projector: the exact operator A (:class:`torchpcct.projector.Projector`) of the inset, usually with a window; it
-            is not kept.
-        weights: W, inverse variances of the line integrals, ``range_shape``, finite and ≥ 0 (zeros are dead readings).
-        nodes: positions at which the exact impulse response is taken: 1 (shift invariant, fastest), 5 (linear in
-            position) or 9 (quadratic, most accurate). Each costs about one pass of the projector; the result can be
-            kept for all noise realisations of a scan and, with :meth:`scaled`, for all its exposures.
+        projector: the exact operator A (:class:`torchpcct.projector.Projector`) of the inset,
+            usually with a window; it is not kept.
+        weights: W, inverse variances of the line integrals, ``range_shape``, finite and ≥ 0 (zeros
+            are dead readings).
+        nodes: positions at which the exact impulse response is taken: 1 (shift invariant, fastest),
+            5 (linear in position) or 9 (quadratic, most accurate). Each costs about one pass of the
+            projector; the result can be kept for all noise realisations of a scan and, with
+            :meth:`scaled`, for all its exposures.
 
     Raises:
-        ValueError: weights of a wrong shape, negative, not finite or all zero; an unknown ``nodes``.
+        ValueError: weights of a wrong shape, negative, not finite or all zero; an unknown
+            ``nodes``.
         TypeError: weights that are not a float tensor.
     """
 
@@ -152,7 +199,7 @@ class Gram:
         self._factor: Tensor | None = None
         self._information: dict[tuple[float, float], float] = {}
 
-    # -- construction ---------------------------------------------------------------------------------------------
+    # -- construction ------------------------------------------------------------------------------
 
     def _fit(self, projector: Any, weights: Tensor, positions: Nodes) -> Tensor:
         """Kernels K_c, ``(terms, bands, nz, 2·ny − 1, 2·nx − 1)``."""
@@ -173,8 +220,16 @@ class Gram:
 
     def _polynomials(self, terms: int) -> Tensor:
         ny, nx = self.grid.shape[-2:]
-        y = torch.linspace(-1, 1, ny, dtype=torch.float64) if ny > 1 else torch.zeros(1, dtype=torch.float64)
-        x = torch.linspace(-1, 1, nx, dtype=torch.float64) if nx > 1 else torch.zeros(1, dtype=torch.float64)
+        y = (
+            torch.linspace(-1, 1, ny, dtype=torch.float64)
+            if ny > 1
+            else torch.zeros(1, dtype=torch.float64)
+        )
+        x = (
+            torch.linspace(-1, 1, nx, dtype=torch.float64)
+            if nx > 1
+            else torch.zeros(1, dtype=torch.float64)
+        )
         yy, xx = torch.meshgrid(y, x, indexing="ij")
         return _monomials(yy, xx, terms).movedim(-1, 0).contiguous()
 
@@ -192,16 +247,20 @@ class Gram:
         other._factor = None if self._factor is None else self._factor.to(device)
         return other
 
-    # -- application ----------------------------------------------------------------------------------------------
+    # -- application -------------------------------------------------------------------------------
 
     def apply(self, x: Tensor) -> Tensor:
-        """G x, ``(..., *grid.shape)``, any leading batch dimensions, differentiable; dtype and device of x.
+        """G x, ``(..., *grid.shape)``, any leading batch dimensions, differentiable; dtype and
+        device of x.
 
         Raises:
             ValueError: a wrong shape.
         """
         if tuple(x.shape[-self.grid.ndim :]) != self.grid.shape:
-            raise ValueError(f"x must have shape (..., {', '.join(map(str, self.grid.shape))}), got {tuple(x.shape)}")
+            raise ValueError(
+                f"x must have shape (..., {', '.join(map(str, self.grid.shape))}), got "
+                f"{tuple(x.shape)}"
+            )
         return apply_linear(x, self._apply, self._apply)  # it is its own adjoint
 
     __call__ = apply
@@ -232,19 +291,22 @@ class Gram:
         rows = torch.fft.ifft(spectrum, dim=-2)[..., :ny, :]
         return torch.fft.irfft(rows, n=self.padded[1], dim=-1)[..., :nx]
 
-    # -- what solvers, priors and training need -------------------------------------------------------------------
+    # -- what solvers, priors and training need ----------------------------------------------------
 
     def periodic_spectrum(self) -> Tensor:
-        """Eigenvalues of the best circulant approximation (T. Chan 1988), ``rfftn`` layout of the grid, ≥ 0."""
+        """Eigenvalues of the best circulant approximation (T. Chan 1988), ``rfftn`` layout of
+        the grid, ≥ 0."""
         spectrum = self._periodic * self.factor
         return spectrum[0] if self._flat else spectrum
 
     @undisturbed
     def lag_kernels(self) -> Tensor:
-        """The K_c in space, factor included: ``(terms, reach + 1, nz, py, px)``, lags (y, x) on the padded ring.
+        """The K_c in space, factor included: ``(terms, reach + 1, nz, py, px)``, lags (y, x) on the
+        padded ring.
 
-        Entry [c, b, z, ly, lx] couples slice z to slice z + b at the in-plane lag (to minus from) modulo ``padded``, so
-        G between two voxels is K₀ plus the mean of both polynomials times K_c (:attr:`polynomials`).
+        Entry [c, b, z, ly, lx] couples slice z to slice z + b at the in-plane lag (to minus from)
+        modulo ``padded``, so G between two voxels is K₀ plus the mean of both polynomials times K_c
+        (:attr:`polynomials`).
         """
         return torch.fft.irfft2(self._spectra, s=self.padded) * self.factor
 
@@ -257,8 +319,8 @@ class Gram:
     def information(self, mu_per_hu: float, frequency: float = REFERENCE_FREQUENCY) -> float:
         """The data's information on an in-plane wave, in 1/(HU² mm³) (2-D: 1/(HU² mm²)).
 
-        Its inverse is the noise power that unregularised least squares has there, in HU² mm³. It is proportional to
-        the exposure and hardly depends on the voxel size.
+        Its inverse is the noise power that unregularised least squares has there, in HU² mm³. It is
+        proportional to the exposure and hardly depends on the voxel size.
 
         Args:
             mu_per_hu: 1 HU in mm⁻¹ (μ_ref / 1000).
@@ -269,17 +331,22 @@ class Gram:
             kernel = self._spectra[0]
             # A wave that is constant along z sees the sum over the bands.
             summed = (kernel[:1].real + 2 * kernel[1:].real.sum(0, keepdim=True)).sum(0)
-            self._information[key] = information_at(frequency, summed, self.padded, self.grid.spacing, mu_per_hu)
+            self._information[key] = information_at(
+                frequency, summed, self.padded, self.grid.spacing, mu_per_hu
+            )
         return self._information[key] * self.factor
 
     def noise(self, batch: tuple[int, ...] = (), *, generator: torch.Generator) -> Tensor:
-        """Draw AᵀW n for counting noise n ~ N(0, W⁻¹) without a projector: covariance G (stationary part).
+        """Draw AᵀW n for counting noise n ~ N(0, W⁻¹) without a projector: covariance G (stationary
+        part).
 
-        So ``apply(x) + noise(...)`` is a draw of the sufficient statistic AᵀW y of a noisy scan of x.
+        So ``apply(x) + noise(...)`` is a draw of the sufficient statistic AᵀW y of a noisy scan of
+        x.
 
         Args:
             batch: leading shape of the result.
-            generator: source of randomness, on any device: one on the CPU gives the same noise everywhere.
+            generator: source of randomness, on any device: one on the CPU gives the same noise
+                everywhere.
 
         Returns:
             ``(*batch, *grid.shape)`` in the dtype of the weights, on the device of the kernels.
@@ -288,14 +355,21 @@ class Gram:
 
     @undisturbed
     def white(self, batch: tuple[int, ...] = (), *, generator: torch.Generator) -> Tensor:
-        """White noise for :meth:`coloured`, ``(*batch, slices, *padded)``; arguments of :meth:`noise`."""
+        """White noise for :meth:`coloured`, ``(*batch, slices, *padded)``; arguments of
+        :meth:`noise`."""
         nz = 1 if self._flat else self.grid.shape[0]
-        drawn = torch.randn((*batch, nz, *self.padded), generator=generator, dtype=self.dtype, device=generator.device)
+        drawn = torch.randn(
+            (*batch, nz, *self.padded),
+            generator=generator,
+            dtype=self.dtype,
+            device=generator.device,
+        )
         return drawn.to(self._of_noise.device)
 
     @undisturbed
     def coloured(self, white: Tensor) -> Tensor:
-        """Noise of covariance G (stationary part) from that of :meth:`white`, ``(*batch, *grid.shape)``."""
+        """Noise of covariance G (stationary part) from that of :meth:`white`, ``(*batch,
+        *grid.shape)``."""
         if self._factor is None:
             self._factor = cholesky(self._of_noise)[0]
         nz, (ny, nx) = white.shape[-3], self.grid.shape[-2:]
@@ -309,14 +383,20 @@ class Gram:
 
 
 def information_at(
-    frequency: float, spectra: Tensor, period: tuple[int, int], spacing: tuple[float, ...], mu_per_hu: float
+    frequency: float,
+    spectra: Tensor,
+    period: tuple[int, int],
+    spacing: tuple[float, ...],
+    mu_per_hu: float,
 ) -> float:
-    """Information on an in-plane wave that is constant along z, in 1/(HU² mm³) (2-D: 1/(HU² mm²)); > 0.
+    """Information on an in-plane wave that is constant along z, in 1/(HU² mm³) (2-D: 1/(HU² mm²));
+    > 0.
 
     Args:
-        frequency: of the wave, lp/mm. What voxels or grid do not hold is read off the nearest that they do, by the law
-            of the ramp, S ∝ 1/f.
-        spectra: ``(slices, period[0], period[1] // 2 + 1)`` in-plane spectra of what AᵀWA answers to such waves.
+        frequency: of the wave, lp/mm. What voxels or grid do not hold is read off the nearest that
+            they do, by the law of the ramp, S ∝ 1/f.
+        spectra: ``(slices, period[0], period[1] // 2 + 1)`` in-plane spectra of what AᵀWA answers
+            to such waves.
         period: voxels of the ring that the spectra are of.
         spacing: voxel size per axis in mm.
         mu_per_hu: 1 HU in mm⁻¹.
@@ -324,7 +404,8 @@ def information_at(
     hy, hx = spacing[-2:]
     double: Any = {"dtype": torch.float64, "device": "cpu"}
     f = torch.hypot(
-        torch.fft.fftfreq(period[0], hy, **double)[:, None], torch.fft.rfftfreq(period[1], hx, **double)[None, :]
+        torch.fft.fftfreq(period[0], hy, **double)[:, None],
+        torch.fft.rfftfreq(period[1], hx, **double)[None, :],
     )
     spectra = spectra.double().cpu()
     wanted = min(frequency, HIGHEST_PER_VOXEL / max(hy, hx))
@@ -332,24 +413,35 @@ def information_at(
     # Rounding must not decide about frequencies on the ring's edge: the unit of length would, too.
     ring = distance <= max(AROUND * wanted, float(distance.min()) * 1.001) * (1.0 + 1e-9)
     per_slice = (spectra[:, ring] * (f[ring] / frequency)).mean(1)
-    # A voxel's own response is the mean of the spectrum over the square of frequencies that voxels hold, on which the
-    # mean of 1/f is 4 ln(1 + √2) voxels. So it tells c of S = c / f where a grid of few voxels tells nothing else.
-    own = torch.fft.irfft2(spectra, s=period)[:, 0, 0] / (4.0 * math.log(1.0 + math.sqrt(2.0)) * math.sqrt(hy * hx))
+    # A voxel's own response is the mean of the spectrum over the square of frequencies that voxels
+    # hold, on which the mean of 1/f is 4 ln(1 + √2) voxels. So it tells c of S = c / f where a grid
+    # of few voxels tells nothing else.
+    own = torch.fft.irfft2(spectra, s=period)[:, 0, 0] / (
+        4.0 * math.log(1.0 + math.sqrt(2.0)) * math.sqrt(hy * hx)
+    )
     found = max(float(per_slice.median()), LEAST_INFORMATION * float(own.median()) / frequency)
     return found * mu_per_hu**2 / math.prod(spacing)
 
 
 def check_weights(weights: Any, shape: tuple[int, ...]) -> None:
-    """Refuse weights that are not finite, ≥ 0 and of the given shape, or all 0 (TypeError, ValueError)."""
+    """Refuse weights that are not finite, ≥ 0 and of the given shape, or all 0 (TypeError,
+    ValueError)."""
     if not isinstance(weights, Tensor) or weights.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"weights must be a float32 or float64 tensor, got {getattr(weights, 'dtype', type(weights))}")
+        raise TypeError(
+            "weights must be a float32 or float64 tensor, got "
+            f"{getattr(weights, 'dtype', type(weights))}"
+        )
     if tuple(weights.shape) != tuple(shape):
-        raise ValueError(f"weights must have the shape of the projector's range {tuple(shape)}, got "
-                         f"{tuple(weights.shape)}")  # fmt: skip
+        raise ValueError(
+            f"weights must have the shape of the projector's range {tuple(shape)}, got "
+            f"{tuple(weights.shape)}"
+        )
     if not torch.isfinite(weights).all():
         raise ValueError("weights must be finite: give readings without information the weight 0")
     if weights.min() < 0:
-        raise ValueError(f"weights must be at least 0 (inverse variances), got {float(weights.min())}")
+        raise ValueError(
+            f"weights must be at least 0 (inverse variances), got {float(weights.min())}"
+        )
     if weights.max() == 0:
         raise ValueError("all weights are 0: no reading carries information")
 
@@ -378,7 +470,8 @@ def _spectra(kernels: Tensor, padded: tuple[int, int]) -> Tensor:
 
 
 def _wrap(kernel: Tensor, period: int, axis: int) -> Tensor:
-    """Lags −(n−1)…n−1 on a ring of ``period``; the lags beyond, which nothing reads, join both ends linearly."""
+    """Lags −(n−1)…n−1 on a ring of ``period``; the lags beyond, which nothing reads, join both
+    ends linearly."""
     kernel = kernel.movedim(axis, -1)
     n = (kernel.shape[-1] + 1) // 2
     positive, negative = kernel[..., n - 1 :], kernel[..., : n - 1]
@@ -393,13 +486,17 @@ def _wrap(kernel: Tensor, period: int, axis: int) -> Tensor:
 
 
 def _banded_add(kernel: Tensor, x: Tensor, scale: float, out: Tensor) -> None:
-    """out += scale · K x, K Hermitian and banded along z: lower bands ``(reach + 1, nz, fy, fx)``."""
+    """out += scale · K x, K Hermitian and banded along z: lower bands ``(reach + 1, nz, fy,
+    fx)``."""
     nz = x.shape[-3]
     if x.device.type == "cpu":
         from recon.gram.kernels import banded_add  # numba loads with its first use
 
         real = kernel.real.numpy().dtype.type
-        k, v, to = (torch.view_as_real(a).flatten(-2).numpy() for a in (kernel, x.reshape(-1, *x.shape[-3:]), out))
+        k, v, to = (
+            torch.view_as_real(a).flatten(-2).numpy()
+            for a in (kernel, x.reshape(-1, *x.shape[-3:]), out)
+        )
         row = 4 * x.shape[-1] * kernel.shape[0] * x[..., 0, 0].numel()
         run(banded_add, x.shape[-2], k, v, real(scale), to.reshape(v.shape), operations=row)
         return
@@ -411,7 +508,8 @@ def _banded_add(kernel: Tensor, x: Tensor, scale: float, out: Tensor) -> None:
 
 
 def _periodic_mean(kernel: Tensor) -> Tensor:
-    """Spectrum of the circulant matrix nearest to the kernel's Toeplitz matrix, floored at 1e-6 of its maximum."""
+    """Spectrum of the circulant matrix nearest to the kernel's Toeplitz matrix, floored at 1e-6
+    of its maximum."""
     bands, nz, wy, wx = kernel.shape
     ny, nx = (wy + 1) // 2, (wx + 1) // 2
     ring = torch.zeros(nz, ny, nx, dtype=torch.float64)

@@ -1,8 +1,9 @@
 """Local impulse responses of AᵀWA: one kernel per in-plane node, banded along z.
 
-A kernel K holds G(p + l, z + b; p, z) for the node p, all slices z, all in-plane lags l and the few slice lags b that
-share a detector row. Along z it is NOT a convolution: the detector's rows sample z coarsely (row pitch at the axis ≥
-voxel), in the same phase in every view near the mid-plane, so that neighbouring slices differ by tens of per cent.
+A kernel K holds G(p + l, z + b; p, z) for the node p, all slices z, all in-plane lags l and the few
+slice lags b that share a detector row. Along z it is NOT a convolution: the detector's rows sample
+z coarsely (row pitch at the axis ≥ voxel), in the same phase in every view near the mid-plane, so
+that neighbouring slices differ by tens of per cent.
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ def node_positions(count: int) -> Nodes:
     if count == 9:
         at = (-0.85, 0.0, 0.85)
         return tuple((y, x) for y in at for x in at)
-    raise ValueError(f"nodes must be 1 (stationary), 5 (linear in position) or 9 (quadratic), got {count}")
+    raise ValueError(
+        f"nodes must be 1 (stationary), 5 (linear in position) or 9 (quadratic), got {count}"
+    )
 
 
 def slice_reach(geometry: Geometry, grid: VolumeGrid) -> int:
@@ -45,7 +48,9 @@ def slice_reach(geometry: Geometry, grid: VolumeGrid) -> int:
     near = geometry.sod - grid.in_plane_radius
     far = geometry.sod + grid.in_plane_radius
     row = geometry.pitch[0] * far / geometry.sdd
-    top = max(abs(geometry.row_positions[0]), abs(geometry.row_positions[-1])) + geometry.pitch[0] / 2
+    top = (
+        max(abs(geometry.row_positions[0]), abs(geometry.row_positions[-1])) + geometry.pitch[0] / 2
+    )
     reach = max(abs(grid.center[0] - grid.extent[0] / 2), abs(grid.center[0] + grid.extent[0] / 2))
     tilt = min(top / geometry.sdd, reach / near)
     lag = (dz + row + tilt * math.hypot(*grid.extent[-2:])) / dz
@@ -62,8 +67,8 @@ def kernel_at(projector: Any, weights: Tensor, node: tuple[int, int], reach: int
         reach: largest slice lag, see :func:`slice_reach`.
 
     Returns:
-        ``(2·reach + 1, nz, 2·ny − 1, 2·nx − 1)``; entry [b, z, ly, lx] couples slice z to slice z + b − reach. The
-        dtype is that of the weights.
+        ``(2·reach + 1, nz, 2·ny − 1, 2·nx − 1)``; entry [b, z, ly, lx] couples slice z to slice z +
+        b − reach. The dtype is that of the weights.
     """
     geometry, grid = projector.geometry, projector.grid
     flat = grid.ndim == 2

@@ -1,6 +1,7 @@
 """CPU kernels of the Gram operator: Hermitian banded matrices along z, one per in-plane frequency.
 
-:func:`torchpcct.threads.run` calls them on ``begin … end`` of the rows of frequencies, or frequencies, or ``todo``.
+:func:`torchpcct.threads.run` calls them on ``begin … end`` of the rows of frequencies, or
+frequencies, or ``todo``.
 """
 
 from __future__ import annotations
@@ -15,14 +16,20 @@ __all__ = ["banded_add", "banded_cholesky", "damp", "stiffen"]
 
 
 # It allocates nothing, and needs no reference counts.
-_VIEWS_ONLY: Any = {"nogil": True, "cache": True, "fastmath": {"contract", "reassoc", "nsz"}, "_nrt": False}
+_VIEWS_ONLY: Any = {
+    "nogil": True,
+    "cache": True,
+    "fastmath": {"contract", "reassoc", "nsz"},
+    "_nrt": False,
+}
 
 
 @njit(**_VIEWS_ONLY)
 def banded_add(begin, end, kernel, x, scale, out):
     """out += scale · K x for every frequency of the rows ``begin … end`` along y.
 
-    Real and imaginary parts stand side by side: a complex product with the scale would take twice the operations.
+    Real and imaginary parts stand side by side: a complex product with the scale would take twice
+    the operations.
 
     Args:
         kernel: ``(reach + 1, nz, fy, 2 · fx)`` lower bands; the main diagonal is real.
@@ -56,7 +63,8 @@ def banded_add(begin, end, kernel, x, scale, out):
 
 @njit(inline="always")
 def _first_failure(matrix, least, lower):
-    """Slice at which the banded Cholesky factorisation meets a pivot ≤ least · diagonal; −1 if none."""
+    """Slice at which the banded Cholesky factorisation meets a pivot ≤ least · diagonal; −1 if
+    none."""
     bands, nz = matrix.shape
     for j in range(nz):
         for b in range(min(bands, nz - j)):
@@ -89,10 +97,12 @@ def banded_cholesky(begin, end, kernel, least, lower, definite):
 
 @njit(nogil=True, cache=True)
 def stiffen(begin, end, terms, points, least, step, most, definite):
-    """Tie neighbouring slices together, just where and as much as the matrices Σ_c points[k, c] terms[c] need it.
+    """Tie neighbouring slices together, just where and as much as the matrices Σ_c points[k, c]
+    terms[c] need it.
 
     Args:
-        terms: ``(terms, reach + 1, nz, frequencies)`` complex128 lower bands; ``terms[0]`` is changed in place.
+        terms: ``(terms, reach + 1, nz, frequencies)`` complex128 lower bands; ``terms[0]`` is
+            changed in place.
         points: ``(points, terms)``.
         least: smallest pivot, as a share of the diagonal.
         step: stiffness added at a time, as a share of the mean diagonal.
@@ -138,12 +148,15 @@ def stiffen(begin, end, terms, points, least, step, most, definite):
 
 @njit(nogil=True, cache=True)
 def damp(begin, end, terms, points, least, kept, shifts, level, lowest, todo):
-    """Damp position-dependent terms, then shift the diagonal, until all Σ_c points[k, c] terms[c] are definite.
+    """Damp position-dependent terms, then shift the diagonal, until all Σ_c points[k, c] terms[c]
+    are definite.
 
     Args:
         terms, points, least: as in :func:`stiffen`; changed in place at the frequencies ``todo``.
-        kept: shares of the terms but the first that are kept, descending to 0; empty where there is but one term.
-        shifts: ascending shares of ``level`` that are added to the diagonal of the first term alone.
+        kept: shares of the terms but the first that are kept, descending to 0; empty where there is
+            but one term.
+        shifts: ascending shares of ``level`` that are added to the diagonal of the first term
+            alone.
         level: ``(frequencies,)`` mean diagonal.
         lowest: what the diagonal becomes at least where nothing helps.
         todo: indices of frequencies.

@@ -1,15 +1,19 @@
-"""A model of AᵀWA for whole fields of view, of any geometry, made from a few exact projection pairs.
+"""A model of AᵀWA for whole fields of view, of any geometry, made from a few exact projection
+pairs.
 
-    AᵀWA ≈ Σ_c D s_c F⁻¹ K_c F s_c D,        D² = AᵀW 1 at each voxel that enough rays meet, Σ_c s_c² = 1,
+    AᵀWA ≈ Σ_c D s_c F⁻¹ K_c F s_c D,        D² = AᵀW 1 at each voxel that enough rays meet, Σ_c
+    s_c² = 1,
 
-K_c the spectrum of the impulse response in the middle of slice c, s_c the share of a slice in it (Fessler and Booth
-1999, IEEE Trans. Image Process. 8:688, with one K). It is too rough to solve with, because the weights of the
-rays change over the field; with the prior's own spectrum beside K it preconditions conjugate gradients on exact pairs,
-which need neither its accuracy nor the memory of :class:`recon.gram.gram.Gram`.
+K_c the spectrum of the impulse response in the middle of slice c, s_c the share of a slice in it
+(Fessler and Booth 1999, IEEE Trans. Image Process. 8:688, with one K). It is too rough to solve
+with, because the weights of the rays change over the field; with the prior's own spectrum beside K
+it preconditions conjugate gradients on exact pairs, which need neither its accuracy nor the memory
+of :class:`recon.gram.gram.Gram`.
 
-One K is enough in a plane and for parallel rays. A circular orbit of a cone beam does not: its middle slice has all
-frequencies, but 36 mm off it, 400 mm from the source, frequencies (f_r, f_z) with f_r < 0.09 f_z are seen by no ray
-(Tuy 1983, SIAM J. Appl. Math. 43:546). A preconditioner that takes them for well seen hardly moves flat faces there.
+One K is enough in a plane and for parallel rays. A circular orbit of a cone beam does not: its
+middle slice has all frequencies, but 36 mm off it, 400 mm from the source, frequencies (f_r, f_z)
+with f_r < 0.09 f_z are seen by no ray (Tuy 1983, SIAM J. Appl. Math. 43:546). A preconditioner that
+takes them for well seen hardly moves flat faces there.
 """
 
 from __future__ import annotations
@@ -30,16 +34,20 @@ from recon.least_squares.qggmrf import BoundPrior
 
 __all__ = ["FieldModel", "GradientStep"]
 
-# Smallest eigenvalue of K, as a share of the median one: between the views' directions it is 0 or, cut off, negative.
+# Smallest eigenvalue of K, as a share of the median one: between the views' directions it is 0 or,
+# cut off, negative.
 LEAST = 0.02
-# Slices that have a K of their own, if waves along z are seen in the outermost of them by this factor less than in the
-# middle.
-NODES, FACTOR = 5, 3.0
-# Voxels that fewer rays meet than this share of those through the middle are not determined by the data. (A ring beyond
-# the field of view, seen by three quarters of the views, converged a hundred pairs later than all within.)
+# Slices that have a K of their own, if waves along z are seen in the outermost of them by this
+# factor less than in the middle.
+NODES = 5
+FACTOR = 3.0
+# Voxels that fewer rays meet than this share of those through the middle are not determined by the
+# data. (A ring beyond the field of view, seen by three quarters of the views, converged a hundred
+# pairs later than all within.)
 DETERMINED = 0.9
-# Voxels that fewer rays meet are scaled as if it were this share, of the same mean weight: scaled by themselves, slices
-# beyond the rows of a cone beam hang on the prior alone and spoil the condition number.
+# Voxels that fewer rays meet are scaled as if it were this share, of the same mean weight: scaled
+# by themselves, slices beyond the rows of a cone beam hang on the prior alone and spoil the
+# condition number.
 LEAST_MET = 0.5
 
 
@@ -47,18 +55,21 @@ class FieldModel:
     """Diagonal and circulant model of x ↦ AᵀW A x.
 
     Args:
-        projector: A, with ``A.T``, ``domain_shape``, ``range_shape`` and ``grid``; nothing else is asked of it.
+        projector: A, with ``A.T``, ``domain_shape``, ``range_shape`` and ``grid``; nothing else is
+            asked of it.
         weights: W, inverse variances of the line integrals, ``range_shape``, finite and ≥ 0.
 
     Attributes:
         seen: AᵀW 1, ``domain_shape``: 0 where no ray of positive weight passes.
         scale: D².
         spectrum: K in the middle, ``rfftn`` layout, > 0.
-        determined: bool, ``domain_shape``: voxels that (nearly) all views see. Beyond, in the corners of a grid that is
-            wider than the field of view and in slices that some views miss, directions are left to the prior alone.
+        determined: bool, ``domain_shape``: voxels that (nearly) all views see. Beyond, in the
+            corners of a grid that is wider than the field of view and in slices that some views
+            miss, directions are left to the prior alone.
 
     Raises:
-        ValueError, TypeError: weights as :class:`recon.gram.gram.Gram` refuses them, or a grid that no ray meets.
+        ValueError, TypeError: weights as :class:`recon.gram.gram.Gram` refuses them, or a grid that
+            no ray meets.
     """
 
     def __init__(self, projector: Any, weights: Tensor) -> None:
@@ -66,7 +77,10 @@ class FieldModel:
         self.grid = projector.grid
         self.seen: Tensor = projector.T(weights)
         if not bool((self.seen > 0).any()):
-            raise ValueError("no ray of positive weight meets the grid: check its centre, in mm, and the geometry")
+            raise ValueError(
+                "no ray of positive weight meets the grid: check its centre, in mm, and the "
+                "geometry"
+            )
         self.at = _central(self.seen)
         met = projector.T((weights > 0).to(weights.dtype))
         met = met / met[self.at]
@@ -89,10 +103,11 @@ class FieldModel:
 
     @cached_property
     def nodes(self) -> list[tuple[Tensor, Tensor]]:
-        """K_c and s_c, ``(z, 1, 1)``, of slices between the first and the last that is determined in the middle.
+        """K_c and s_c, ``(z, 1, 1)``, of slices between the first and the last that is determined
+        in the middle.
 
-        Where one K will do, it alone, with the share 1. A volume costs two projection pairs to find out, and two more
-        for the other slices, when this is first asked for.
+        Where one K will do, it alone, with the share 1. A volume costs two projection pairs to find
+        out, and two more for the other slices, when this is first asked for.
         """
         alone = [(self.spectrum, torch.ones_like(self.spectrum.flatten()[0]))]
         if self.grid.ndim < 3:
@@ -107,13 +122,20 @@ class FieldModel:
         outer = [self._spectrum((z, *self.at[1:])) for z in (slices[0], slices[-1])]
         if min(float((k / self.spectrum)[:, 0, 0].log().mean()) for k in outer) > -math.log(FACTOR):
             return alone
-        inner = [self.spectrum if z == self.at[0] else self._spectrum((z, *self.at[1:])) for z in slices[1:-1]]
+        inner = [
+            self.spectrum if z == self.at[0] else self._spectrum((z, *self.at[1:]))
+            for z in slices[1:-1]
+        ]
         return list(zip([outer[0], *inner, outer[1]], _shares(slices, self.seen), strict=True))
 
     def information(
-        self, mu_per_hu: float, frequency: float = REFERENCE_FREQUENCY, spacing: tuple[float, ...] | None = None
+        self,
+        mu_per_hu: float,
+        frequency: float = REFERENCE_FREQUENCY,
+        spacing: tuple[float, ...] | None = None,
     ) -> float:
-        """The data's information in the middle of the grid, see :meth:`recon.gram.gram.Gram.information`.
+        """The data's information in the middle of the grid, see
+        :meth:`recon.gram.gram.Gram.information`.
 
         Args:
             mu_per_hu: 1 HU in mm⁻¹.
@@ -141,7 +163,8 @@ class FieldModel:
 
 
 class GradientStep:
-    """Steps of preconditioned conjugate gradients: −Σ_c D⁻¹ s_c F⁻¹ (K_c + η_c R)⁻¹ F s_c D⁻¹ times the gradient.
+    """Steps of preconditioned conjugate gradients: −Σ_c D⁻¹ s_c F⁻¹ (K_c + η_c R)⁻¹ F s_c D⁻¹ times
+    the gradient.
 
     Args:
         nodes: K_c, ``rfftn`` layout of the grid, > 0, with s_c, which broadcast to the grid.
@@ -165,7 +188,8 @@ class GradientStep:
         inverse = torch.ones((), dtype=x.dtype, device=x.device)
         if scale is not None:
             self._scale, inverse = scale.to(x).rsqrt(), scale.to(x).reciprocal()
-        # In units of D² the prior weighs more where fewer rays pass: η_c is its mean over the slices of c.
+        # In units of D² the prior weighs more where fewer rays pass: η_c is its mean over the
+        # slices of c.
         self._nodes = [(k.to(x), s.to(x), _mean(inverse, s.to(x))) for k, s in nodes]
 
     def step(self, x: Tensor, data_gradient: Tensor) -> tuple[Tensor, int]:
@@ -173,12 +197,15 @@ class GradientStep:
         g = data_gradient + self.prior.gradient(x)
         axes = tuple(range(-len(self._grid), 0))
         g = g if self._scale is None else g * self._scale
-        if self._steps & (self._steps - 1) == 0:  # after 0, 1, 2, 4, 8 … steps: by then x hardly changes
+        # after 0, 1, 2, 4, 8 … steps: by then x hardly changes
+        if self._steps & (self._steps - 1) == 0:
             self._share = mean_share(self.prior, x)
         self._steps += 1
         step = torch.zeros_like(g)
         for data, share, weight in self._nodes:
-            part = torch.fft.rfftn(g * share, dim=axes).div_(data + self._share * weight * self._prior)
+            part = torch.fft.rfftn(g * share, dim=axes).div_(
+                data + self._share * weight * self._prior
+            )
             step -= share * torch.fft.irfftn(part, s=self._grid, dim=axes)
         return (step if self._scale is None else step * self._scale), 0
 
@@ -190,7 +217,8 @@ def _mean(inverse: Tensor, share: Tensor) -> float:
 
 
 def _shares(slices: Sequence[int], like: Tensor) -> list[Tensor]:
-    """s_c of every slice, ``(z, 1, 1)``: between two nodes cosine and sine, so that their squares add to 1."""
+    """s_c of every slice, ``(z, 1, 1)``: between two nodes cosine and sine, so that their
+    squares add to 1."""
     z = torch.arange(len(like), dtype=torch.float64, device=like.device)
     found = []
     for k, node in enumerate(slices):
@@ -204,7 +232,8 @@ def _shares(slices: Sequence[int], like: Tensor) -> list[Tensor]:
 
 
 def _central(seen: Tensor) -> tuple[int, ...]:
-    """The voxel next to the middle of the grid that at least half the median information of seen voxels reaches."""
+    """The voxel next to the middle of the grid that at least half the median information of seen
+    voxels reaches."""
     enough = seen >= 0.5 * seen[seen > 0].median()
     distance = torch.zeros((), device=seen.device)
     for axis, n in enumerate(seen.shape):
@@ -215,10 +244,13 @@ def _central(seen: Tensor) -> tuple[int, ...]:
 
 
 def _periodic(response: Tensor, at: tuple[int, ...]) -> Tensor:
-    """Eigenvalues of the circulant matrix next to the response at ``at`` (T. Chan 1988), ``rfftn`` layout, > 0."""
+    """Eigenvalues of the circulant matrix next to the response at ``at`` (T. Chan 1988),
+    ``rfftn`` layout, > 0."""
     for axis, (n, k) in enumerate(zip(response.shape, at, strict=True)):
         lag = (torch.arange(n, device=response.device) - k).abs().to(response)
         response = response * (1 - lag / n).reshape(-1, *[1] * (response.dim() - 1 - axis))
     response = torch.roll(response, [-k for k in at], tuple(range(response.dim())))
     spectrum = torch.fft.rfftn(response).real
-    return spectrum.clamp_min(LEAST * float(spectrum.median().clamp_min(1e-6 * float(spectrum.max()))))
+    return spectrum.clamp_min(
+        LEAST * float(spectrum.median().clamp_min(1e-6 * float(spectrum.max())))
+    )

@@ -1,7 +1,7 @@
 """A scan of any scanner and the whole field that its rays cross: data, weights, grid, PWLS.
 
-Everything that the rays meet must lie in the grid. If readings that miss the grid see something, the problem is solved
-on a larger one (``work``), and the part that was asked for is cut out.
+Everything that the rays meet must lie in the grid. If readings that miss the grid see something,
+the problem is solved on a larger one (``work``), and the part that was asked for is cut out.
 """
 
 from __future__ import annotations
@@ -36,17 +36,20 @@ __all__ = ["FieldProblem", "field_prior", "is_whole_field"]
 REFERENCE_VOXEL_MM = 0.25
 # Distance from the minimum, beyond the field of view, from which it is named.
 UNDETERMINED_HU = 10.0
-# Readings that miss the grid see something if the mean of a patch of so many cells each way is above this line integral
-# (half a millimetre of water) and this share of the mean of the readings that meet it.
+# Readings that miss the grid see something if the mean of a patch of so many cells each way is
+# above this line integral (half a millimetre of water) and this share of the mean of the readings
+# that meet it.
 PATCH = 8
 SEES_SOMETHING = (0.01, 0.03)
 
 
 def field_prior(voxel_mm: float, dimensions: int = 3) -> QGGMRF:
-    """The default prior of a whole field: the curvatures of data and prior are equal at 0.19 line pairs per voxel.
+    """The default prior of a whole field: the curvatures of data and prior are equal at 0.19 line
+    pairs per voxel.
 
-    A picture of an object twice as large on voxels twice as large looks the same, from micro-CT to a clinical scanner.
-    At 0.25 mm it is :data:`recon.least_squares.qggmrf.DEFAULT_PRIOR`, whose threshold follows the noise.
+    A picture of an object twice as large on voxels twice as large looks the same, from micro-CT to
+    a clinical scanner. At 0.25 mm it is :data:`recon.least_squares.qggmrf.DEFAULT_PRIOR`, whose
+    threshold follows the noise.
 
     Args:
         voxel_mm: in-plane voxel size.
@@ -63,15 +66,18 @@ def is_whole_field(scan: Scan, grid: VolumeGrid) -> bool:
     if not isinstance(geometry, ConeBeam):
         return True  # an inset of a scan given view by view is solved on all that its rays cross
     edges = zip(grid.extent[1:], grid.center[1:], strict=True)
-    return all(extent / 2 - abs(center) >= geometry.fov_radius / math.sqrt(2) for extent, center in edges)
+    return all(
+        extent / 2 - abs(center) >= geometry.fov_radius / math.sqrt(2) for extent, center in edges
+    )
 
 
 class FieldProblem:
     """What scans of one geometry share on one grid.
 
     Args:
-        scan: without a known surround; counting, or energy integrating with ``quantum``. Its own readings, smoothed,
-            give the weights (:meth:`torchpcct.Scan.weights`): dead readings weigh nothing.
+        scan: without a known surround; counting, or energy integrating with ``quantum``. Its own
+            readings, smoothed, give the weights (:meth:`torchpcct.Scan.weights`): dead readings
+            weigh nothing.
         grid: ``(z, y, x)``; of a parallel or fan beam ``(y, x)`` or ``(slices, y, x)``.
 
     Attributes:
@@ -87,10 +93,14 @@ class FieldProblem:
         geometry = scan.geometry
         self.plane = len(geometry.shape) == 2
         if not self.plane and scan.counts.ndim != 3:
-            raise ValueError("PWLS in HU needs a counting-mode scan; decompose or sum the energy bins before")
+            raise ValueError(
+                "PWLS in HU needs a counting-mode scan; decompose or sum the energy bins before"
+            )
         if self.plane and tuple(grid.shape[:-2]) != tuple(scan.counts.shape[:-2]):
             wanted = (*scan.counts.shape[:-2], "y", "x")
-            raise ValueError(f"this scan needs a grid of the shape {wanted} (slices first), got {grid.shape}")
+            raise ValueError(
+                f"this scan needs a grid of the shape {wanted} (slices first), got {grid.shape}"
+            )
         self.warnings = check_rows(geometry, grid)
         self.grid, self.geometry, self.mu_ref = grid, geometry, scan.linearisation.mu_ref
         self.unit = scan.unit
@@ -113,7 +123,8 @@ class FieldProblem:
         # Means over patches: one that lies beside the body is enough, noise is not.
         size = [min(PATCH, n) for n in lines.shape[-2:]]
         seen, count = (
-            F.avg_pool2d(v.reshape(-1, 1, *lines.shape[-2:]), size, size) for v in (lines * outside, outside)
+            F.avg_pool2d(v.reshape(-1, 1, *lines.shape[-2:]), size, size)
+            for v in (lines * outside, outside)
         )
         return bool((seen > level * count).logical_and_(count >= 0.25).any())
 
@@ -131,7 +142,8 @@ class FieldProblem:
         return [(a, b.contiguous()) for a, b in pairs]
 
     def start(self, lines: Tensor) -> Tensor | None:
-        """FBP on ``work`` as the first volume: low frequencies are right, and PWLS needs half of the projections.
+        """FBP on ``work`` as the first volume: low frequencies are right, and PWLS needs half of
+        the projections.
 
         None where FBP refuses the geometry (views that do not suffice).
         """
@@ -161,9 +173,14 @@ class FieldProblem:
         return field_prior(self.grid.spacing[-1], self.work.ndim)
 
     def solutions(
-        self, scans: Sequence[Scan], prior: QGGMRF, options: PwlsOptions, advance: Callable[[float], None]
+        self,
+        scans: Sequence[Scan],
+        prior: QGGMRF,
+        options: PwlsOptions,
+        advance: Callable[[float], None],
     ) -> Iterator[Solution]:
-        """PWLS of every scan, slice by slice, from FBP as the first volume; ``advance`` is told the finished share."""
+        """PWLS of every scan, slice by slice, from FBP as the first volume; ``advance`` is told
+        the finished share."""
         hu = self.mu_ref / 1000.0
         for i, scan in enumerate(scans):
             slices = self.slices(scan)
@@ -171,16 +188,20 @@ class FieldProblem:
             tests: list[ResidualTest] = []
             found: list[str] = []
             for k, (y, w) in enumerate(slices):
-                results.append(pwls(self.projector, y, w, prior, mu_per_hu=hu, start=self.start(y), **options))
+                results.append(
+                    pwls(self.projector, y, w, prior, mu_per_hu=hu, start=self.start(y), **options)
+                )
                 if not scan.noise_free:
                     tests += tested(RESIDUAL_TEST, found, self.residual_test, y, w, results[-1].x)
                 advance((i + (k + 1) / len(slices)) / len(scans))
             report = {**joined([dict(r.report) for r in results]), "work_grid": self.work.shape}
             if report["undetermined_rmsd_hu"] > UNDETERMINED_HU:
                 found.append(
-                    f"{100 * report['undetermined']:.0f} % of the voxels are missed by some views (corners beyond the "
+                    f"{100 * report['undetermined']:.0f} % of the voxels are missed by some views "
+                    "(corners beyond the "
                     "field of view, outer slices): there the volume is "
-                    f"{in_words(report['undetermined_rmsd_hu'], self.unit, self.mu_ref)} from the minimum"
+                    f"{in_words(report['undetermined_rmsd_hu'], self.unit, self.mu_ref)} from the "
+                    "minimum"
                 )
             yield Solution(self.hu([r.x for r in results]), report, found, tests)
 
@@ -230,7 +251,9 @@ def larger_grid(grid: VolumeGrid, geometry: Any) -> VolumeGrid:
 
 def joined(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """One report of several slices: counts are added, the worst slice speaks for the rest."""
-    worst = dict(max(reports, key=lambda r: (not r["converged"], r["rmsd_hu"][-1] if r["rmsd_hu"] else 0.0)))
+    worst = dict(
+        max(reports, key=lambda r: (not r["converged"], r["rmsd_hu"][-1] if r["rmsd_hu"] else 0.0))
+    )
     if len(reports) > 1:
         worst["exact_pairs"] = sum(r["exact_pairs"] for r in reports)
         worst["misfit"] = [m for r in reports for m in r["misfit"]]

@@ -1,4 +1,5 @@
-"""Model-based reconstruction of a small inset: crop to its footprint, take the background off, solve PWLS, give HU."""
+"""Model-based reconstruction of a small inset: crop to its footprint, take the background off,
+solve PWLS, give HU."""
 
 from __future__ import annotations
 
@@ -52,33 +53,42 @@ class InsetProblem:
     """What all realisations of one scan on one grid share: projector, weights, Gram, background.
 
     Args:
-        scan: a counting-mode scan of the family; its noise does not matter. A scan of the whole detector without a
-            known surround serves too: what lies around the grid is then found from its own readings, scan by scan
-            (:mod:`recon.least_squares.surround`). Of a grid that holds the whole field of view see
+        scan: a counting-mode scan of the family; its noise does not matter. A scan of the whole
+            detector without a known surround serves too: what lies around the grid is then found
+            from its own readings, scan by scan (:mod:`recon.least_squares.surround`). Of a grid
+            that holds the whole field of view see
             :class:`recon.least_squares.field_problem.FieldProblem`.
         grid: ``(z, y, x)`` grid that holds everything the background does not.
-        nodes: of the Gram operator. Linear in position (5) is enough for solvers: what the model lacks, the exact
-            pairs repair, and each step costs half of that with 9.
+        nodes: of the Gram operator. Linear in position (5) is enough for solvers: what the model
+            lacks, the exact pairs repair, and each step costs half of that with 9.
 
-    The weights are the inverse variances of the line integrals expected from the BACKGROUND: weights from the noisy
-    readings themselves would bias the result, and a small inset changes the counts behind it by a few per cent only.
+    The weights are the inverse variances of the line integrals expected from the BACKGROUND:
+    weights from the noisy readings themselves would bias the result, and a small inset changes the
+    counts behind it by a few per cent only.
 
     Attributes:
-        prior: the default one, :data:`recon.least_squares.qggmrf.DEFAULT_PRIOR` in the length unit of the scan
-            (:func:`recon.least_squares.surround.length_unit`): on the paper's scanner 0.75 line pairs per mm.
+        prior: the default one, :data:`recon.least_squares.qggmrf.DEFAULT_PRIOR` in the length unit
+            of the scan (:func:`recon.least_squares.surround.length_unit`): on the paper's scanner
+            0.75 line pairs per mm.
         weights: on ``window``, at 1 s, of line integrals in mm⁻¹ · mm.
         model: of AᵀWA at 1 s, :func:`recon.least_squares.pwls.data_model`.
 
     Raises:
-        ValueError: a grid outside the field of view or the scan's region; a spectral or energy-integrating scan.
+        ValueError: a grid outside the field of view or the scan's region; a spectral or
+            energy-integrating scan.
     """
 
     @undisturbed
     def __init__(self, scan: Scan, grid: VolumeGrid, nodes: int = 5) -> None:
         if scan.counts.ndim != 3:
-            raise ValueError("PWLS in HU needs a counting-mode scan; decompose or sum the energy bins before")
+            raise ValueError(
+                "PWLS in HU needs a counting-mode scan; decompose or sum the energy bins before"
+            )
         if not scan.counting:
-            raise ValueError("PWLS and MBIR weigh readings as photon counts; use fbp for an energy-integrating scan")
+            raise ValueError(
+                "PWLS and MBIR weigh readings as photon counts; use fbp for an energy-integrating "
+                "scan"
+            )
         self.grid, self.geometry = grid, scan.geometry
         self.prior = DEFAULT_PRIOR.stretched(length_unit(scan.geometry), grid.ndim)
         self.outer = scan.window or DetectorWindow.full(scan.geometry)
@@ -104,10 +114,12 @@ class InsetProblem:
         self._place(None)
 
     def _start_unknown(self, scan: Scan, exposure: float) -> None:
-        """Weights from the smoothed readings themselves; what surrounds the inset is found scan by scan."""
+        """Weights from the smoothed readings themselves; what surrounds the inset is found scan
+        by scan."""
         if is_whole_field(scan, self.grid):
             raise ValueError(
-                "the grid holds the whole field of view: use recon.least_squares.field_problem.FieldProblem"
+                "the grid holds the whole field of view: use "
+                "recon.least_squares.field_problem.FieldProblem"
             )
         geometry, grid = self.geometry, self.grid
         self.window = footprint(geometry, grid, margin=1)
@@ -119,7 +131,8 @@ class InsetProblem:
             self.level = self._around.level(scan.line_integrals())
         except ValueError as error:
             raise ValueError(
-                f"what lies around this inset is not known, and has to be found by FBP of the whole field: {error}; or "
+                "what lies around this inset is not known, and has to be found by FBP of the "
+                f"whole field: {error}; or "
                 "take a grid that holds the whole field of view"
             ) from error
 
@@ -131,8 +144,8 @@ class InsetProblem:
         if motion is None:
             self.model = Gram(self.projector, self.weights, nodes=self._nodes)
             return
-        # A displaced grid sees its voxels as the grid at rest does, a magnification of 0.3 % apart, but through the
-        # weights of where it is.
+        # A displaced grid sees its voxels as the grid at rest does, a magnification of 0.3 % apart,
+        # but through the weights of where it is.
         still = footprint(geometry, grid, margin=1)
         first = np.clip(self.window.first_column, 0, geometry.columns - still.columns)
         along = DetectorWindow(first, still.columns, still.first_row, still.rows)
@@ -148,7 +161,8 @@ class InsetProblem:
         """
         if not isinstance(self.model, Gram):
             raise ValueError(
-                "the grid takes more than half of the detector's columns, too much for the FFT model of a small inset: "
+                "the grid takes more than half of the detector's columns, too much for the FFT "
+                "model of a small inset: "
                 'use method="pwls", or a smaller grid'
             )
         return self.model
@@ -157,8 +171,9 @@ class InsetProblem:
     def with_motion(self, motion: Any) -> InsetProblem:
         """The same problem for an inset that moves.
 
-        The background stands still; it is taken off before, so that only what moves is projected. The Gram is that of a
-        grid at rest with the weights that the moving one meets; exact pairs use the moving projector.
+        The background stands still; it is taken off before, so that only what moves is projected.
+        The Gram is that of a grid at rest with the weights that the moving one meets; exact pairs
+        use the moving projector.
 
         Args:
             motion: displacement of the inset in every view, ``(views, 3)`` z, y, x mm
@@ -168,7 +183,9 @@ class InsetProblem:
             ValueError: the surround is not known.
         """
         if self._background is None:
-            raise ValueError("motion compensation needs the surround at rest: acquire the scan with region=")
+            raise ValueError(
+                "motion compensation needs the surround at rest: acquire the scan with region="
+            )
         check_rows(self.geometry, self.grid, motion)
         other = copy.copy(self)
         other._place(motion)
@@ -176,15 +193,21 @@ class InsetProblem:
 
     @undisturbed
     def data(self, scan: Scan) -> Tensor:
-        """Line integrals of a scan on the grid's footprint, background taken off, ``(views, rows, columns)``."""
-        if (scan.window or DetectorWindow.full(scan.geometry)) != self.outer or scan.geometry != self.geometry:
-            raise ValueError("this scan has another geometry or window than the one the problem was made for")
+        """Line integrals of a scan on the grid's footprint, background taken off, ``(views,
+        rows, columns)``."""
+        if (
+            scan.window or DetectorWindow.full(scan.geometry)
+        ) != self.outer or scan.geometry != self.geometry:
+            raise ValueError(
+                "this scan has another geometry or window than the one the problem was made for"
+            )
         if self._around is not None:
             return self._around.take_off(scan.line_integrals(), self.level)
         if self._background is None:
             return self.outer.crop(scan.line_integrals(), self.window)
         require_same_surround(scan, self._background)
-        # The logarithm is taken of the footprint alone; the bridge over dead readings needs their neighbours.
+        # The logarithm is taken of the footprint alone; the bridge over dead readings needs their
+        # neighbours.
         near = scan if scan.dead is not None or scan.window is None else scan.crop(self.window)
         lines = near.line_integrals()
         if near is scan:
@@ -208,8 +231,9 @@ class InsetProblem:
     def residual_test(self, scan: Scan, volume: Tensor, data: Tensor | None = None) -> ResidualTest:
         """Whether a volume ``(z, y, x)`` in HU explains a noisy scan, by one projection of it.
 
-        The variances are those of the counts that the volume itself predicts. ``data`` is :meth:`data` of the scan,
-        where it is at hand already. Raises ``ValueError`` for a noise-free scan, which no statistic describes.
+        The variances are those of the counts that the volume itself predicts. ``data`` is
+        :meth:`data` of the scan, where it is at hand already. Raises ``ValueError`` for a
+        noise-free scan, which no statistic describes.
         """
         from torchpcct.metrics.residual_test import residual_test  # loads scipy.stats
 
@@ -230,12 +254,17 @@ class InsetProblem:
         """
         exposures = {s.exposure_s or NOISE_FREE_EXPOSURE_S for s in scans}
         if len(exposures) != 1:
-            raise ValueError(f"the scans of one batch must have one exposure, got {sorted(exposures)} s")
+            raise ValueError(
+                f"the scans of one batch must have one exposure, got {sorted(exposures)} s"
+            )
         return float(exposures.pop())
 
     @undisturbed
-    def solve_statistic(self, b: Tensor, exposure_s: float, prior: QGGMRF, tolerance: float) -> PwlsResult:
-        """PWLS of what :meth:`statistic` gives alone: the volumes of :meth:`solve`, in mm⁻¹ above ``level``.
+    def solve_statistic(
+        self, b: Tensor, exposure_s: float, prior: QGGMRF, tolerance: float
+    ) -> PwlsResult:
+        """PWLS of what :meth:`statistic` gives alone: the volumes of :meth:`solve`, in mm⁻¹ above
+        ``level``.
 
         Args:
             b: AᵀW y ``(..., *grid.shape)`` with the weights of the exposure.
@@ -248,34 +277,57 @@ class InsetProblem:
             return self.projector.T(weights * self.projector(x))
 
         return solve_normal(
-            b, exact, self.model.scaled(exposure_s), prior, mu_per_hu=self.mu_ref / 1000.0, spacing=self.grid.spacing,
+            b,
+            exact,
+            self.model.scaled(exposure_s),
+            prior,
+            mu_per_hu=self.mu_ref / 1000.0,
+            spacing=self.grid.spacing,
             tolerance=tolerance,
-        )  # fmt: skip
+        )
 
     @undisturbed
     def solve(
-        self, scans: Sequence[Scan], prior: QGGMRF, data: Sequence[Tensor] | None = None, **options: Unpack[PwlsOptions]
+        self,
+        scans: Sequence[Scan],
+        prior: QGGMRF,
+        data: Sequence[Tensor] | None = None,
+        **options: Unpack[PwlsOptions],
     ) -> tuple[Tensor, dict[str, Any]]:
-        """PWLS of several realisations of one exposure: ``(scans, z, y, x)`` HU, and the solver's report.
+        """PWLS of several realisations of one exposure: ``(scans, z, y, x)`` HU, and the solver's
+        report.
 
         ``data`` are :meth:`data` of the scans, where they are at hand already.
         """
         exposure = self.exposure(scans)
         lines = [self.data(s) for s in scans] if data is None else list(data)
         result = pwls(
-            self.projector, torch.stack(lines), self.weights * exposure, prior, mu_per_hu=self.mu_ref / 1000.0,
-            gram=self.model.scaled(exposure), **options,
-        )  # fmt: skip
+            self.projector,
+            torch.stack(lines),
+            self.weights * exposure,
+            prior,
+            mu_per_hu=self.mu_ref / 1000.0,
+            gram=self.model.scaled(exposure),
+            **options,
+        )
         return to_hu(result.x + self.level, self.mu_ref), dict(result.report)
 
     def solutions(
-        self, scans: Sequence[Scan], prior: QGGMRF, options: PwlsOptions, advance: Callable[[float], None]
+        self,
+        scans: Sequence[Scan],
+        prior: QGGMRF,
+        options: PwlsOptions,
+        advance: Callable[[float], None],
     ) -> Iterator[Solution]:
         """PWLS of all scans together; ``advance`` is told the finished share of them."""
         data = [self.data(s) for s in scans]
         found, report = self.solve(scans, prior, data, **options)
         for scan, lines, values in zip(scans, data, found.to(torch.float32), strict=True):
             said: list[str] = []
-            tests = [] if scan.noise_free else tested(RESIDUAL_TEST, said, self.residual_test, scan, values, lines)
+            tests = (
+                []
+                if scan.noise_free
+                else tested(RESIDUAL_TEST, said, self.residual_test, scan, values, lines)
+            )
             yield Solution(values, report, said, tests)
         advance(1.0)

@@ -16,8 +16,8 @@ from torchpcct.validate import whole
 
 __all__ = ["available_bytes", "gram_bytes", "pwls_bytes", "require_memory", "resident_bytes"]
 
-# Arrays of one volume's size that live at once: statistic, volume, gradients, two steps with their images, the prior's
-# and the transform's temporaries, the spectra of a whole field.
+# Arrays of one volume's size that live at once: statistic, volume, gradients, two steps with their
+# images, the prior's and the transform's temporaries, the spectra of a whole field.
 VOLUMES = 21
 # Arrays of the data's size besides the arguments: weighted data, projection, their product.
 SINOGRAMS = 3
@@ -42,7 +42,8 @@ def pwls_bytes(A: Any, batch: int, dtype: torch.dtype, device: torch.device) -> 
     """Largest memory that :func:`recon.least_squares.pwls.pwls` needs besides its arguments.
 
     Args:
-        A: the exact operator; one without ``memory_estimate`` counts as if it needed nothing itself.
+        A: the exact operator; one without ``memory_estimate`` counts as if it needed nothing
+            itself.
         batch: volumes at a time.
         dtype: of the data.
         device: where the data lie.
@@ -50,12 +51,17 @@ def pwls_bytes(A: Any, batch: int, dtype: torch.dtype, device: torch.device) -> 
     volume, data = torch.Size(A.domain_shape).numel(), torch.Size(A.range_shape).numel()
     item = dtype.itemsize * max(batch, 1)
     estimate = getattr(A, "memory_estimate", None)
-    inside = estimate(max(batch, 1), dtype, device) - item * (volume + data) if estimate is not None else 0
+    inside = (
+        estimate(max(batch, 1), dtype, device) - item * (volume + data)
+        if estimate is not None
+        else 0
+    )
     return int(inside + item * (VOLUMES * volume + SINOGRAMS * data))
 
 
 def require_memory(A: Any, y: Tensor, memory: int | None) -> None:
-    """Refuse data ``(..., *A.range_shape)`` whose reconstruction does not fit into ``memory`` bytes.
+    """Refuse data ``(..., *A.range_shape)`` whose reconstruction does not fit into ``memory``
+    bytes.
 
     Args:
         A: the exact operator.
@@ -72,8 +78,10 @@ def require_memory(A: Any, y: Tensor, memory: int | None) -> None:
     free = available_bytes(y.device) if memory is None else memory
     if need > free:
         raise ValueError(
-            f"PWLS of {batch} volume(s) {tuple(A.domain_shape)} from data {tuple(A.range_shape)} needs "
-            f"{need / 2**30:.2f} GiB, {free / 2**30:.2f} GiB are available: take larger or fewer voxels, float32, "
+            f"PWLS of {batch} volume(s) {tuple(A.domain_shape)} from data {tuple(A.range_shape)} "
+            "needs "
+            f"{need / 2**30:.2f} GiB, {free / 2**30:.2f} GiB are available: take larger or fewer "
+            "voxels, float32, "
             "fewer volumes at a time, or bin the readings"
         )
 

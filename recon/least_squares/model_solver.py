@@ -1,4 +1,5 @@
-"""Inner iterations of PWLS: preconditioned nonlinear conjugate gradients on the FFT model of the data term."""
+"""Inner iterations of PWLS: preconditioned nonlinear conjugate gradients on the FFT model of the
+data term."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ __all__ = ["ModelSolver", "line_search", "mean_share"]
 # Steps below this many units of rounding of the first one are noise.
 ROUNDING = 30.0
 # Iterations end when the preconditioned gradient norm has fallen by this factor, or after so many.
-REDUCTION, MOST = 3e-3, 60
+REDUCTION = 3e-3
+MOST = 60
 
 
 class ModelSolver:
@@ -39,7 +41,8 @@ class ModelSolver:
         return torch.fft.irfftn(spectrum, s=self._grid, dim=axes)
 
     def step(self, x: Tensor, data_gradient: Tensor) -> tuple[Tensor, int]:
-        """The minimising d, ``(batch, *shape)``, and the number of iterations (applications of G)."""
+        """The minimising d, ``(batch, *shape)``, and the number of iterations (applications of
+        G)."""
         prior, axes = self.prior, self.prior.axes
         d = torch.zeros_like(x)
         model = data_gradient
@@ -47,7 +50,8 @@ class ModelSolver:
         share = mean_share(prior, x)
         z = self._precondition(q, share)
         qz = dot(q, z, axes)
-        if self._floor is None:  # rounding: the first, largest energy sets what later steps can resolve
+        # rounding: the first, largest energy sets what later steps can resolve
+        if self._floor is None:
             self._floor = qz * (ROUNDING * torch.finfo(x.dtype).eps) ** 2
         goal = torch.maximum(qz * REDUCTION**2, self._floor)
         if bool((qz <= self._floor).all()):
@@ -84,10 +88,18 @@ def mean_share(prior: BoundPrior, x: Tensor) -> float:
 
 
 def line_search(
-    prior: BoundPrior, x: Tensor, step: Tensor, curved: Tensor, data_gradient: Tensor, *, start: float, most: int,
+    prior: BoundPrior,
+    x: Tensor,
+    step: Tensor,
+    curved: Tensor,
+    data_gradient: Tensor,
+    *,
+    start: float,
+    most: int,
     tolerance: float = 0.0,
-) -> Tensor:  # fmt: skip
-    """α of the minimum of α gᵀs + ½ α² sᵀH s + R(x + α s) for each volume, ``(batch,)`` float64: majorise, minimise.
+) -> Tensor:
+    """α of the minimum of α gᵀs + ½ α² sᵀH s + R(x + α s) for each volume, ``(batch,)`` float64:
+    majorise, minimise.
 
     Args:
         prior: R.
@@ -104,7 +116,11 @@ def line_search(
         pull, stiffness = prior.along(x + per_volume(alpha, x) * step, step, step)
         total = bend + stiffness
         # A slightly indefinite model must not reverse the step.
-        move = torch.where(total > 0, (slope + alpha * bend + pull) / total.clamp_min(1e-300), torch.zeros_like(total))
+        move = torch.where(
+            total > 0,
+            (slope + alpha * bend + pull) / total.clamp_min(1e-300),
+            torch.zeros_like(total),
+        )
         alpha = alpha - move
         if tolerance and float(move.abs().max()) < tolerance:
             break

@@ -1,19 +1,23 @@
-"""Penalised weighted least squares, to the minimum itself: of a small inset, or of a whole field of view.
+"""Penalised weighted least squares, to the minimum itself: of a small inset, or of a whole field of
+view.
 
     Φ(x) = ½ ‖y − A x‖²_W + R(x)
 
-One outer iteration: a step is proposed, one exact projection pair (A, Aᵀ) measures what it does, it is made conjugate
-to the step before, and a majorising line search from 0 sets its length (flexible conjugate gradients, Notay 2000, SIAM
-J. Sci. Comput. 22:1444; Huber's parabolas for R). So Φ falls in every iteration, whoever proposes the step, and the
-result is the minimum of Φ itself, not of a model. Two proposers:
+One outer iteration: a step is proposed, one exact projection pair (A, Aᵀ) measures what it does, it
+is made conjugate to the step before, and a majorising line search from 0 sets its length (flexible
+conjugate gradients, Notay 2000, SIAM J. Sci. Comput. 22:1444; Huber's parabolas for R). So Φ falls
+in every iteration, whoever proposes the step, and the result is the minimum of Φ itself, not of a
+model. Two proposers:
 
-* Inset: the FFT model of AᵀWA (:class:`recon.gram.gram.Gram`) solves for what is left (defect correction). Its misfit
-  is measured with the first exact pair; a model that does not fit loses its place to
-* the preconditioned gradient (:class:`recon.least_squares.field_model.GradientStep`), for whole fields from the start:
-  there a projection pair costs no more than the model would, and the weights change too much over the field.
+* Inset: the FFT model of AᵀWA (:class:`recon.gram.gram.Gram`) solves for what is left (defect
+  correction). Its misfit is measured with the first exact pair; a model that does not fit loses its
+  place to
+* the preconditioned gradient (:class:`recon.least_squares.field_model.GradientStep`), for whole
+  fields from the start: there a projection pair costs no more than the model would, and the weights
+  change too much over the field.
 
-Two channels whose noise is correlated (:mod:`recon.least_squares.basis_problem`) are the same problem with a 2 × 2
-matrix of every ray for its weight.
+Two channels whose noise is correlated (:mod:`recon.least_squares.basis_problem`) are the same
+problem with a 2 × 2 matrix of every ray for its weight.
 """
 
 from __future__ import annotations
@@ -38,20 +42,31 @@ from recon.linear_operator import NormalOperator
 from torchpcct.detector_window import footprint
 from torchpcct.validate import checked, number, renamed, whole
 
-__all__ = ["Approach", "PwlsOptions", "PwlsResult", "data_model", "mean_weights", "pwls", "solve_normal", "weigh"]
+__all__ = [
+    "Approach",
+    "PwlsOptions",
+    "PwlsResult",
+    "data_model",
+    "mean_weights",
+    "pwls",
+    "solve_normal",
+    "weigh",
+]
 
 
 class Approach:
     """How far is it still? Extrapolated from how far the iterates have come, volume by volume.
 
-    After k iterations the way d from iterate ¾ k to k is compared with that from ½ k to ¾ k: if it is q times as long,
-    a geometric series goes on for q d / (1 − q). That is not believed below d itself. Where convergence gets faster the
-    last sixth tells more: the same of it, not believed below 0.7 d, counts if it is less. Single estimates can be low:
-    of the latest the largest counts. On 19 runs (planes of 160² to 416², cones of 48³ to 128³, weak and default priors,
-    from FBP and from 0) volumes that it called 1 HU from the minimum were at 0.05 to 0.85 HU; on 8 others, which took
-    no part in its choice, at 0.31 to 0.46 HU. It can be low where the data hardly hold a border that others hang on: by
-    2.5 times with a weak prior in a fan beam whose field of view ends inside the grid, nearly all of it at its edge.
-    Seen on a sample of the voxels, so that the iterates need not be kept.
+    After k iterations the way d from iterate ¾ k to k is compared with that from ½ k to ¾ k: if it
+    is q times as long, a geometric series goes on for q d / (1 − q). That is not believed below d
+    itself. Where convergence gets faster the last sixth tells more: the same of it, not believed
+    below 0.7 d, counts if it is less. Single estimates can be low: of the latest the largest
+    counts. On 19 runs (planes of 160² to 416², cones of 48³ to 128³, weak and default priors, from
+    FBP and from 0) volumes that it called 1 HU from the minimum were at 0.05 to 0.85 HU; on 8
+    others, which took no part in its choice, at 0.31 to 0.46 HU. It can be low where the data
+    hardly hold a border that others hang on: by 2.5 times with a weak prior in a fan beam whose
+    field of view ends inside the grid, nearly all of it at its edge. Seen on a sample of the
+    voxels, so that the iterates need not be kept.
 
     Args:
         x: the first volumes ``(batch, *shape)``.
@@ -67,7 +82,9 @@ class Approach:
         if voxels is not None:
             here = here[voxels.expand(x.shape[1:]).flatten()]
         if here.numel() > self.SAMPLE:
-            picked = torch.randperm(here.numel(), generator=torch.Generator().manual_seed(0))[: self.SAMPLE]
+            picked = torch.randperm(here.numel(), generator=torch.Generator().manual_seed(0))[
+                : self.SAMPLE
+            ]
             here = here[picked.to(here.device)]
         self._here = here
         self._seen = [self._sample(x)]
@@ -86,7 +103,9 @@ class Approach:
         k = len(self._seen) - 1
         if not self._here.numel() or k < 2 * self.LEAST:
             return
-        found = [self._ahead(k, max(self.LEAST, k // part), least) for part, least in self.STRETCHES]
+        found = [
+            self._ahead(k, max(self.LEAST, k // part), least) for part, least in self.STRETCHES
+        ]
         self._left.append(float(torch.stack(found).min(0).values.max()))
 
     def _ahead(self, k: int, lag: int, least: float) -> Tensor:
@@ -115,8 +134,9 @@ PATIENCE = 4
 SLOWEST = 0.9
 # The gradient is followed by recurrence and measured afresh after so many pairs: rounding adds up.
 REFRESH = 25
-# Rounding does not fall with the gradient: after a start whose data gradient is so many times that of 0, and where the
-# FFT model sees nothing but rounding, it is measured afresh before the minimum counts as reached.
+# Rounding does not fall with the gradient: after a start whose data gradient is so many times that
+# of 0, and where the FFT model sees nothing but rounding, it is measured afresh before the minimum
+# counts as reached.
 FAR_START = 2.0
 # A grid that takes a larger share of the detector's columns is a whole field, not an inset.
 INSET_SHARE = 0.5
@@ -130,18 +150,20 @@ class PwlsResult:
 
     Args:
         x: ``(..., *grid.shape)`` mm⁻¹.
-        report: ``exact_pairs`` (A and Aᵀ applied together), ``inner_iterations`` (of the FFT model, one entry per
-            outer iteration), ``gradient`` (norm of the exact gradient of Φ over that of the zero volume, worst volume
-            of the batch, one entry per outer iteration), ``rmsd_hu`` (root mean square distance to the minimum in HU,
-            worst volume, one entry per outer iteration: as the FFT model sees it from the exact gradient and its
-            steps shrink (``ahead``); for a whole field extrapolated from the latest steps, over the voxels that
-            the data determine: ``recon.least_squares.field_model.FieldModel.determined``), ``undetermined`` (share of
-            the other voxels), ``undetermined_rmsd_hu`` (the same estimate over them), ``converged``, ``tolerance_hu``,
-            ``model`` ("gram" or "gradient": who proposed the last step), ``model_misfit`` (of the FFT model on the
-            first step, None without one), ``misfit`` (weighted squared residual per reading of positive weight, one
-            entry per volume: about 1 for the right weights and many more readings than unknowns; from
-            :func:`solve_normal`, unless it is told of the data, None), ``seconds``, and the prior (``strength``,
-            ``lambda``, ``threshold_hu_per_mm``, ``p``, ``q``).
+        report: ``exact_pairs`` (A and Aᵀ applied together), ``inner_iterations`` (of the FFT model,
+            one entry per outer iteration), ``gradient`` (norm of the exact gradient of Φ over that
+            of the zero volume, worst volume of the batch, one entry per outer iteration),
+            ``rmsd_hu`` (root mean square distance to the minimum in HU, worst volume, one entry per
+            outer iteration: as the FFT model sees it from the exact gradient and its steps shrink
+            (``ahead``); for a whole field extrapolated from the latest steps, over the voxels that
+            the data determine: ``recon.least_squares.field_model.FieldModel.determined``),
+            ``undetermined`` (share of the other voxels), ``undetermined_rmsd_hu`` (the same
+            estimate over them), ``converged``, ``tolerance_hu``, ``model`` ("gram" or "gradient":
+            who proposed the last step), ``model_misfit`` (of the FFT model on the first step, None
+            without one), ``misfit`` (weighted squared residual per reading of positive weight, one
+            entry per volume: about 1 for the right weights and many more readings than unknowns;
+            from :func:`solve_normal`, unless it is told of the data, None), ``seconds``, and the
+            prior (``strength``, ``lambda``, ``threshold_hu_per_mm``, ``p``, ``q``).
     """
 
     x: Tensor
@@ -149,7 +171,8 @@ class PwlsResult:
 
 
 class PwlsOptions(TypedDict, total=False):
-    """Options of :func:`pwls` that whoever calls it for a scan hands on; each is described there."""
+    """Options of :func:`pwls` that whoever calls it for a scan hands on; each is described
+    there."""
 
     tolerance: float
     max_exact: int
@@ -176,45 +199,51 @@ def pwls(
     """Minimise ½‖y − A x‖²_W + R(x), in 2-D and 3-D, for an inset or a whole field of view.
 
     Args:
-        A: the exact operator (:class:`torchpcct.projector.Projector`, or any other with ``A.T``, ``domain_shape``,
-            ``range_shape`` and ``grid``).
-        y: line integrals ``(..., *A.range_shape)`` float32 or float64, of all that lies in the beam: whatever the grid
-            does not hold must have been taken off. Readings of weight 0 may hold anything. Leading dimensions are
-            independent noise realisations. Of two channels ``(..., 2, *A.range_shape)``.
-        weights: W, ``A.range_shape``: expected inverse variances of y (from smooth expected counts: weights taken
-            from the noisy counts themselves bias the result). Of two channels the information of every ray,
-            ``(3, *A.range_shape)`` F₁₁, F₁₂, F₂₂, in place of W; near a multiple of the identity for the sake of speed.
+        A: the exact operator (:class:`torchpcct.projector.Projector`, or any other with ``A.T``,
+            ``domain_shape``, ``range_shape`` and ``grid``).
+        y: line integrals ``(..., *A.range_shape)`` float32 or float64, of all that lies in the
+            beam: whatever the grid does not hold must have been taken off. Readings of weight 0 may
+            hold anything. Leading dimensions are independent noise realisations. Of two channels
+            ``(..., 2, *A.range_shape)``.
+        weights: W, ``A.range_shape``: expected inverse variances of y (from smooth expected counts:
+            weights taken from the noisy counts themselves bias the result). Of two channels the
+            information of every ray, ``(3, *A.range_shape)`` F₁₁, F₁₂, F₂₂, in place of W; near a
+            multiple of the identity for the sake of speed.
         prior: a prior in noise-normalised units, or one that is bound already.
-        mu_per_hu: 1 HU in mm⁻¹ (μ of water / 1000), or of channels what counts as 1 HU; default: water at about 64 keV.
-        gram: model of AᵀWA with these weights (of channels with :func:`mean_weights`) (:class:`recon.gram.gram.Gram` or
-            :class:`recon.least_squares.field_model.FieldModel`, kept from an earlier call); default:
-            :func:`data_model`.
-        start: first volume ``(..., *grid.shape)`` mm⁻¹, default 0. It costs one exact pair and does not change the
-            result; the volume returned has no larger Φ.
-        tolerance: stop when the volume is this close to the minimum: root mean square, in HU (see ``rmsd_hu``), where
-            the data determine it; corners that some views miss hang on the prior and converge last. float32 may leave
-            5e-4 of the volume's noise (``tests/bench/precision.md``).
-        max_exact: largest number of exact pairs; if it is reached, the report says ``converged: False`` and a
-            warning is logged.
-        memory: bytes that may be used besides the arguments; default: what the machine has left. The need is
-            predicted before anything is allocated.
-        callback: called before each outer iteration with a dict of ``outer``, ``exact_pairs``, ``gradient``,
-            ``rmsd_hu`` and ``x``, the volumes so far ``(batch, *grid.shape)``, not to be changed.
+        mu_per_hu: 1 HU in mm⁻¹ (μ of water / 1000), or of channels what counts as 1 HU; default:
+            water at about 64 keV.
+        gram: model of AᵀWA with these weights (of channels with :func:`mean_weights`)
+            (:class:`recon.gram.gram.Gram` or :class:`recon.least_squares.field_model.FieldModel`,
+            kept from an earlier call); default: :func:`data_model`.
+        start: first volume ``(..., *grid.shape)`` mm⁻¹, default 0. It costs one exact pair and does
+            not change the result; the volume returned has no larger Φ.
+        tolerance: stop when the volume is this close to the minimum: root mean square, in HU (see
+            ``rmsd_hu``), where the data determine it; corners that some views miss hang on the
+            prior and converge last. float32 may leave 5e-4 of the volume's noise
+            (``tests/bench/precision.md``).
+        max_exact: largest number of exact pairs; if it is reached, the report says ``converged:
+            False`` and a warning is logged.
+        memory: bytes that may be used besides the arguments; default: what the machine has left.
+            The need is predicted before anything is allocated.
+        callback: called before each outer iteration with a dict of ``outer``, ``exact_pairs``,
+            ``gradient``, ``rmsd_hu`` and ``x``, the volumes so far ``(batch, *grid.shape)``, not to
+            be changed.
         hu: the former name of ``mu_per_hu``.
 
     Returns:
         The volume in the dtype of y, and the report.
 
     Raises:
-        ValueError: shapes that do not fit, data that are not finite, weights that are negative or all 0,
-            a tolerance ≤ 0, too little memory.
+        ValueError: shapes that do not fit, data that are not finite, weights that are negative or
+            all 0, a tolerance ≤ 0, too little memory.
         TypeError: data or weights that are not float tensors.
 
     Example:
         >>> import numpy as np, torch
         >>> from recon.least_squares.qggmrf import DEFAULT_PRIOR
         >>> from torchpcct import ParallelBeam, Projector, VolumeGrid
-        >>> A = Projector(ParallelBeam(np.arange(30) * np.pi / 30, 24, 1.0), VolumeGrid((16, 16), 1.0))
+        >>> geometry = ParallelBeam(np.arange(30) * np.pi / 30, 24, 1.0)
+        >>> A = Projector(geometry, VolumeGrid((16, 16), 1.0))
         >>> lines = A(torch.full(A.domain_shape, 0.02))
         >>> found = pwls(A, lines, torch.full(A.range_shape, 1e4), DEFAULT_PRIOR, tolerance=1.0)
         >>> found.report["converged"], round(float(found.x.mean()), 3)
@@ -241,7 +270,9 @@ def pwls(
 
     weighted = weighed(y)
     if not torch.isfinite(weighted).all():
-        raise ValueError("y holds NaN or Inf in readings of positive weight: give these readings the weight 0")
+        raise ValueError(
+            "y holds NaN or Inf in readings of positive weight: give these readings the weight 0"
+        )
     model = data_model(A, mean) if gram is None else gram
 
     def exact(x: Tensor) -> Tensor:
@@ -251,9 +282,19 @@ def pwls(
     energy, readings = dot(weighted, y, len(shape)), int(known.sum()) * (1 + channels)
     del y
     result = solve_normal(
-        A.T(weighted), exact, model, prior, mu_per_hu=mu_per_hu, spacing=A.grid.spacing, channels=channels, start=start,
-        tolerance=tolerance, max_exact=max_exact, callback=callback, data=(energy.reshape(-1), readings),
-    )  # fmt: skip
+        A.T(weighted),
+        exact,
+        model,
+        prior,
+        mu_per_hu=mu_per_hu,
+        spacing=A.grid.spacing,
+        channels=channels,
+        start=start,
+        tolerance=tolerance,
+        max_exact=max_exact,
+        callback=callback,
+        data=(energy.reshape(-1), readings),
+    )
     return PwlsResult(result.x, {**result.report, "seconds": time.perf_counter() - started})
 
 
@@ -270,21 +311,29 @@ def mean_weights(information: Tensor) -> Tensor:
 
 
 def check_information(information: Any, shape: tuple[int, ...]) -> None:
-    """Refuse information matrices that are not finite and positive semi-definite, of a wrong shape, or all 0."""
+    """Refuse information matrices that are not finite and positive semi-definite, of a wrong
+    shape, or all 0."""
     check_data("information", information, (3, *shape))
     if not torch.isfinite(information).all():
         raise ValueError("information must be finite: give rays that hold none the matrix 0")
     f11, f12, f22 = information
     slack = 1e-5 * (f11 * f22).clamp_min(0)
-    if bool((f11 < 0).any()) or bool((f22 < 0).any()) or bool((f12 * f12 > f11 * f22 + slack).any()):
-        raise ValueError("information must be positive semi-definite on every ray, packed as F11, F12, F22")
+    if (
+        bool((f11 < 0).any())
+        or bool((f22 < 0).any())
+        or bool((f12 * f12 > f11 * f22 + slack).any())
+    ):
+        raise ValueError(
+            "information must be positive semi-definite on every ray, packed as F11, F12, F22"
+        )
     if not bool((f11 + f22 > 0).any()):
         raise ValueError("all information is 0: no ray says anything about the inset")
 
 
 @checked
 def data_model(A: Any, weights: Tensor, nodes: int = 9) -> Gram | FieldModel:
-    """The model of AᵀWA that suits the grid: FFT with position-dependent kernels for an inset, else the field's.
+    """The model of AᵀWA that suits the grid: FFT with position-dependent kernels for an inset, else
+    the field's.
 
     Args:
         A: the exact operator.
@@ -296,7 +345,10 @@ def data_model(A: Any, weights: Tensor, nodes: int = 9) -> Gram | FieldModel:
     """
     geometry = getattr(A, "geometry", None)
     inset = False
-    if geometry is not None and gram_bytes(geometry, A.grid, weights.element_size(), nodes) <= GRAM_BYTES:
+    if (
+        geometry is not None
+        and gram_bytes(geometry, A.grid, weights.element_size(), nodes) <= GRAM_BYTES
+    ):
         try:
             inset = footprint(geometry, A.grid).columns <= INSET_SHARE * geometry.columns
         except ValueError:  # the grid reaches beyond the field of view
@@ -326,10 +378,13 @@ def solve_normal(
         b: ``(..., [channels,] *grid.shape)``.
         exact: x ↦ H x = AᵀWA x; ``gram.apply`` itself solves the model's problem.
         gram: the model of H: ``apply(x)``, ``periodic_spectrum()`` and, for a :class:`QGGMRF`,
-            ``information(mu_per_hu, frequency)``; or a :class:`recon.least_squares.field_model.FieldModel`.
+            ``information(mu_per_hu, frequency)``; or a
+            :class:`recon.least_squares.field_model.FieldModel`.
         spacing: voxel size per axis in mm.
-        channels: whether the volumes have an axis of channels, which the prior joins and ``gram`` treats alike.
-        data: yᵀW y of each volume, ``(batch,)``, and the number of readings of positive weight, for ``misfit``.
+        channels: whether the volumes have an axis of channels, which the prior joins and ``gram``
+            treats alike.
+        data: yᵀW y of each volume, ``(batch,)``, and the number of readings of positive weight, for
+            ``misfit``.
         prior, mu_per_hu, start, tolerance, max_exact, callback: see :func:`pwls`.
     """
     started = time.perf_counter()
@@ -338,9 +393,13 @@ def solve_normal(
     number("tolerance", tolerance, positive=True, unit="HU")
     whole("max_exact", max_exact)
     if start is not None and tuple(start.shape[-axes:]) != tuple(shape):
-        raise ValueError(f"start must have shape (..., {', '.join(map(str, shape))}), got {tuple(start.shape)}")
+        raise ValueError(
+            f"start must have shape (..., {', '.join(map(str, shape))}), got {tuple(start.shape)}"
+        )
     if isinstance(prior, QGGMRF):
-        bound = prior.bind(gram.information(mu_per_hu, prior.frequency), spacing, mu_per_hu, channels)
+        bound = prior.bind(
+            gram.information(mu_per_hu, prior.frequency), spacing, mu_per_hu, channels
+        )
     else:
         bound = prior
     lead = b.shape[:-axes]
@@ -369,7 +428,9 @@ def solve_normal(
     distances: list[float] = []
     proposals: list[float] = []
     determined = (
-        gram.determined if isinstance(gram, FieldModel) else torch.ones(shape[-len(spacing) :], dtype=torch.bool)
+        gram.determined
+        if isinstance(gram, FieldModel)
+        else torch.ones(shape[-len(spacing) :], dtype=torch.bool)
     )
     approach, beyond = Approach(x, determined), Approach(x, ~determined)
     misfit: float | None = None
@@ -384,12 +445,22 @@ def solve_normal(
         proposals.append(proposed)
         by_model = isinstance(proposer, ModelSolver)
         distances.append(
-            ahead(proposals) if by_model else approach.remaining() / mu_per_hu if approach.known else proposed
+            ahead(proposals)
+            if by_model
+            else approach.remaining() / mu_per_hu
+            if approach.known
+            else proposed
         )
         if callback is not None:
-            callback({
-                "outer": len(inner), "exact_pairs": pairs, "gradient": gradients[-1], "rmsd_hu": distances[-1], "x": x,
-            })  # fmt: skip
+            callback(
+                {
+                    "outer": len(inner),
+                    "exact_pairs": pairs,
+                    "gradient": gradients[-1],
+                    "rmsd_hu": distances[-1],
+                    "x": x,
+                }
+            )
         converged = distances[-1] <= tolerance and (by_model or approach.known or proposed == 0.0)
         rounded = by_model and count == 0 and previous is not None
         if converged and (far or rounded) and not afresh and pairs < max_exact:
@@ -397,7 +468,8 @@ def solve_normal(
             pairs += 1
             afresh, converged = True, False
             previous, approach = None, Approach(x, determined)
-            proposer = ModelSolver(gram, bound, b) if by_model else proposer  # its sense of rounding, too
+            # its sense of rounding, too
+            proposer = ModelSolver(gram, bound, b) if by_model else proposer
             continue
         if converged or pairs >= max_exact:
             break
@@ -410,7 +482,10 @@ def solve_normal(
         if previous is not None:
             step, curved = _conjugate(x, step, curved, previous, bound)
         # From 0: there a majorising search cannot end above where it began.
-        alpha = per_volume(line_search(bound, x, step, curved, data_gradient, start=0.0, most=12, tolerance=1e-3), x)
+        alpha = per_volume(
+            line_search(bound, x, step, curved, data_gradient, start=0.0, most=12, tolerance=1e-3),
+            x,
+        )
         x = x + alpha * step
         data_gradient = data_gradient + alpha * curved
         approach.add(x)
@@ -421,9 +496,12 @@ def solve_normal(
             pairs += 1
     if not converged:
         _LOG.warning(
-            "PWLS stopped after %d exact pairs, %.3g HU from the minimum (tolerance %.3g HU): raise max_exact",
-            pairs, distances[-1], tolerance,
-        )  # fmt: skip
+            "PWLS stopped after %d exact pairs, %.3g HU from the minimum (tolerance %.3g HU): "
+            "raise max_exact",
+            pairs,
+            distances[-1],
+            tolerance,
+        )
     change = 0.5 * dot(x, data_gradient - b, axes)  # ½ xᵀHx − bᵀx
     misfits = None if data is None else ((data[0] + 2 * change).clamp_min(0) / data[1]).tolist()
     report = {
@@ -457,11 +535,13 @@ def _misfit(gram: NormalOperator, step: Tensor, curved: Tensor, axes: int) -> fl
 
 
 def ahead(proposals: Sequence[float]) -> float:
-    """How far the minimum still is if the steps that the FFT model proposes go on to shrink as the last one did.
+    """How far the minimum still is if the steps that the FFT model proposes go on to shrink as the
+    last one did.
 
-    If each is q times the one before, d (1 + q + q² …) is ahead; but a model that shrinks its steps slowly takes them
-    too short, so what follows the last step counts twice. On insets with q from 0.02 to 0.45 the result was 0.8 to 1.25
-    times the true distance; d alone was up to 2.2 times too short.
+    If each is q times the one before, d (1 + q + q² …) is ahead; but a model that shrinks its steps
+    slowly takes them too short, so what follows the last step counts twice. On insets with q from
+    0.02 to 0.45 the result was 0.8 to 1.25 times the true distance; d alone was up to 2.2 times too
+    short.
 
     Args:
         proposals: lengths of the proposed steps.
@@ -483,6 +563,8 @@ def _conjugate(
     _, old_prior = bound.along(x, old, old)
     _, mixed_prior = bound.along(x, step, old)
     down = dot(old, old_curved, bound.axes) + old_prior
-    beta = -(dot(step, old_curved, bound.axes) + mixed_prior) / down.clamp_min(torch.finfo(torch.float64).tiny)
+    beta = -(dot(step, old_curved, bound.axes) + mixed_prior) / down.clamp_min(
+        torch.finfo(torch.float64).tiny
+    )
     beta = per_volume(torch.where(down > 0, beta, torch.zeros_like(beta)), step)
     return step + beta * old, curved + beta * old_curved

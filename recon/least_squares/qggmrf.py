@@ -1,24 +1,28 @@
-"""The q-generalised Gaussian Markov random field: the edge-preserving prior of model-based reconstruction.
+"""The q-generalised Gaussian Markov random field: the edge-preserving prior of model-based
+reconstruction.
 
-Potential of a gradient t (HU/mm) between two neighbours (Thibault, Sauer, Bouman, Hsieh 2007, Med. Phys. 34:4526,
-eq. 18, normalised to curvature 1 at t = 0 for p = 2)::
+Potential of a gradient t (HU/mm) between two neighbours (Thibault, Sauer, Bouman, Hsieh 2007, Med.
+Phys. 34:4526, eq. 18, normalised to curvature 1 at t = 0 for p = 2)::
 
     ρ(t) = |t|ᵖ T²⁻ᵖ / (p (1 + |t / T|ᵖ⁻ᵠ)),        1 ≤ q ≤ p ≤ 2
 
-Below the threshold T it acts like ``|t|ᵖ`` (smooths noise), above like ``|t|ᵠ`` (lets edges pass); it is convex.
-p = q = 2 is the quadratic prior (with half the curvature, see :func:`quadratic`).
+Below the threshold T it acts like ``|t|ᵖ`` (smooths noise), above like ``|t|ᵠ`` (lets edges pass);
+it is convex. p = q = 2 is the quadratic prior (with half the curvature, see :func:`quadratic`).
 
-The energy is a Riemann sum over the volume, so it does not depend on the voxel size, to first order::
+The energy is a Riemann sum over the volume, so it does not depend on the voxel size, to first
+order::
 
     R(x) = λ V Σ_{pairs} ω_d ρ((x_j − x_k) / (mu_per_hu d)),      V voxel volume, d distance in mm,
 
-with ω_d ∝ d (the usual weight 1/d on squared differences) and Σ_d ω_d = the number of dimensions: a linear ramp of
-g HU/mm costs ½ λ g² per mm³ when g ≪ T. λ is in 1/(HU² mm) and comes from the noise level, see :meth:`QGGMRF.bind`.
+with ω_d ∝ d (the usual weight 1/d on squared differences) and Σ_d ω_d = the number of dimensions: a
+linear ramp of g HU/mm costs ½ λ g² per mm³ when g ≪ T. λ is in 1/(HU² mm) and comes from the noise
+level, see :meth:`QGGMRF.bind`.
 
-For several channels at once t is the Euclidean length of their common gradient, ``|x_j − x_k| / (mu_per_hu d)``: an
-edge in one channel relaxes the penalty of all channels there, as basis images share the edges of the tissues (vectorial
-regularisation, Sapiro and Ringach 1996; for spectral CT Rigie and La Rivière 2015). The length treats all directions in
-the space of channels alike, so the channels must be of equal, uncorrelated noise
+For several channels at once t is the Euclidean length of their common gradient, ``|x_j − x_k| /
+(mu_per_hu d)``: an edge in one channel relaxes the penalty of all channels there, as basis images
+share the edges of the tissues (vectorial regularisation, Sapiro and Ringach 1996; for spectral CT
+Rigie and La Rivière 2015). The length treats all directions in the space of channels alike, so the
+channels must be of equal, uncorrelated noise
 (:class:`recon.least_squares.basis_problem.Whitening`).
 """
 
@@ -40,7 +44,8 @@ from torchpcct.validate import number
 
 __all__ = ["DEFAULT_PRIOR", "QGGMRF", "BoundPrior", "quadratic"]
 
-# Below p = 2 the curvature at 0 is infinite: gradients are rounded off at this fraction of the threshold.
+# Below p = 2 the curvature at 0 is infinite: gradients are rounded off at this fraction of the
+# threshold.
 ROUNDING = 1e-3
 
 
@@ -49,11 +54,13 @@ class QGGMRF:
     """A q-GGMRF prior in noise-normalised units.
 
     Args:
-        strength: s ≥ 0. The prior's curvature equals that of the data at ``frequency · s^(-1/3)``, at any dose and
-            voxel size: with the frequency 0.5 lp/mm s = 1 blurs at 0.5 lp/mm, s = 1/8 at 1 lp/mm. The resolution of
-            small contrasts hence stays and the noise falls as dose^(−1/2).
-        threshold: T in HU/mm, or, with ``relative=True``, in units of ``(λ mm³)^(−1/2)``, a gradient scale that follows
-            the noise (∝ dose^(−1/2)). ``inf`` makes the prior quadratic.
+        strength: s ≥ 0. The prior's curvature equals that of the data at ``frequency · s^(-1/3)``,
+            at any dose and voxel size: with the frequency 0.5 lp/mm s = 1 blurs at 0.5 lp/mm, s =
+            1/8 at 1 lp/mm. The resolution of small contrasts hence stays and the noise falls as
+            dose^(−1/2).
+        threshold: T in HU/mm, or, with ``relative=True``, in units of ``(λ mm³)^(−1/2)``, a
+            gradient scale that follows the noise (∝ dose^(−1/2)). ``inf`` makes the prior
+            quadratic.
         p, q: exponents of small and large gradients, 1 ≤ q ≤ p ≤ 2.
         neighbors: 26 (2-D: 8) or 6 (2-D: 4).
         relative: how to read ``threshold``.
@@ -76,22 +83,28 @@ class QGGMRF:
         number("strength", self.strength, low=0.0)
         number("threshold", self.threshold, positive=True, finite=False)
         if not 1.0 <= self.q <= self.p <= 2.0:
-            raise ValueError(f"the exponents need 1 ≤ q ≤ p ≤ 2 for a convex prior, got p = {self.p}, q = {self.q}")
+            raise ValueError(
+                f"the exponents need 1 ≤ q ≤ p ≤ 2 for a convex prior, got p = {self.p}, q = "
+                f"{self.q}"
+            )
         if self.neighbors not in (6, 26):
             raise ValueError(f"neighbors must be 6 or 26 (2-D: 4 or 8), got {self.neighbors}")
 
     def stretched(self, factor: float, dimensions: int = 3) -> QGGMRF:
-        """The prior of a scan that has all lengths ``factor`` times as large: its image is the same, voxel by voxel.
+        """The prior of a scan that has all lengths ``factor`` times as large: its image is the
+        same, voxel by voxel.
 
         Args:
             factor: > 0.
             dimensions: of the volume.
         """
-        # With all lengths times m and attenuations divided by it, gradients are divided by m, and the energy keeps its
-        # value if λ is divided by m^(dimensions − 2).
+        # With all lengths times m and attenuations divided by it, gradients are divided by m, and
+        # the energy keeps its value if λ is divided by m^(dimensions − 2).
         power = dimensions / 2 if self.relative else 1.0
         factor = number("factor", factor, positive=True)
-        return replace(self, frequency=self.frequency / factor, threshold=self.threshold * factor**-power)
+        return replace(
+            self, frequency=self.frequency / factor, threshold=self.threshold * factor**-power
+        )
 
     def bind(
         self, information: float, spacing: Sequence[float], mu_per_hu: float, channels: bool = False
@@ -110,15 +123,17 @@ class QGGMRF:
         threshold = self.threshold
         if self.relative and lam > 0:
             threshold = self.threshold / math.sqrt(lam)
-        return BoundPrior(lam, threshold, self.p, self.q, self.neighbors, tuple(spacing), mu_per_hu, channels)
+        return BoundPrior(
+            lam, threshold, self.p, self.q, self.neighbors, tuple(spacing), mu_per_hu, channels
+        )
 
 
 DEFAULT_PRIOR = QGGMRF(strength=0.3, threshold=16.0, relative=True)
-"""Chosen on held-out plaques (not the paper's) at 0.35 and 2 s for the contrast slope of FBP's soft kernel with the
-least noise: the curvatures of data and prior are equal at 0.75 line pairs per mm at every dose. The threshold
-must follow the noise: one of 300 HU/mm lets that of 0.35 s pass as edges (338 HU of it in plain fat). A stronger
-prior lowers the noise of ROI means further, but shrinks the contrast of a millimetre-sized core: look at means
-and slope, not at CNR alone."""
+"""Chosen on held-out plaques (not the paper's) at 0.35 and 2 s for the contrast slope of FBP's soft
+kernel with the least noise: the curvatures of data and prior are equal at 0.75 line pairs per mm at
+every dose. The threshold must follow the noise: one of 300 HU/mm lets that of 0.35 s pass as edges
+(338 HU of it in plain fat). A stronger prior lowers the noise of ROI means further, but shrinks the
+contrast of a millimetre-sized core: look at means and slope, not at CNR alone."""
 
 
 def quadratic(strength: float) -> QGGMRF:
@@ -128,7 +143,8 @@ def quadratic(strength: float) -> QGGMRF:
 
 @dataclass(frozen=True)
 class BoundPrior:
-    """A q-GGMRF energy of volumes ``(..., [channels,] *grid.shape)`` in mm⁻¹. Made by :meth:`QGGMRF.bind`.
+    """A q-GGMRF energy of volumes ``(..., [channels,] *grid.shape)`` in mm⁻¹. Made by
+    :meth:`QGGMRF.bind`.
 
     Args:
         lam: λ in 1/(HU² mm).
@@ -154,7 +170,7 @@ class BoundPrior:
         number("mu_per_hu (μ_ref / 1000)", self.mu_per_hu, positive=True, unit="mm⁻¹")
         number("lam", self.lam, low=0.0)
 
-    # -- the potential: the only place where its formula stands ---------------------------------------------------
+    # -- the potential: the only place where its formula stands ------------------------------------
 
     def _size(self, t: Tensor) -> Tensor:
         return t.abs() if self.p == 2.0 else torch.sqrt(t * t + (ROUNDING * self._finite) ** 2)
@@ -181,13 +197,14 @@ class BoundPrior:
         return rho(self._size(t)) - zero
 
     def curvature(self, t: Tensor) -> Tensor:
-        """ρ'(t) / t: the curvature of the parabola through (t, ρ(t)) that lies above ρ everywhere (Huber)."""
+        """ρ'(t) / t: the curvature of the parabola through (t, ρ(t)) that lies above ρ
+        everywhere (Huber)."""
         s = self._size(t)
         bend = self._bend(s)
         head = torch.ones_like(s) if self.p == 2.0 else (s / self._finite).pow(self.p - 2)
         return head * (1 + (self.q / self.p) * bend) / (1 + bend) ** 2
 
-    # -- the energy -----------------------------------------------------------------------------------------------
+    # -- the energy --------------------------------------------------------------------------------
 
     @property
     def offsets(self) -> tuple[tuple[tuple[int, ...], float, float], ...]:
@@ -197,7 +214,12 @@ class BoundPrior:
         for step in itertools.product((-1, 0, 1), repeat=axes):
             if step <= (0,) * axes or (self.neighbors == 6 and sum(map(abs, step)) != 1):
                 continue
-            found.append((step, math.sqrt(sum((i * h) ** 2 for i, h in zip(step, self.spacing, strict=True)))))
+            found.append(
+                (
+                    step,
+                    math.sqrt(sum((i * h) ** 2 for i, h in zip(step, self.spacing, strict=True))),
+                )
+            )
         total = sum(d for _, d in found)
         return tuple((step, d, axes * d / total) for step, d in found)
 
@@ -211,25 +233,43 @@ class BoundPrior:
         return math.prod(self.spacing)
 
     def _check(self, x: Tensor, **others: Tensor) -> None:
-        """Refuse volumes of too few axes or of another kind than float, and others that are not like the first."""
+        """Refuse volumes of too few axes or of another kind than float, and others that are not
+        like the first."""
         if not isinstance(x, Tensor) or x.dtype not in (torch.float32, torch.float64):
-            raise TypeError(f"x must be a float32 or float64 tensor, got {getattr(x, 'dtype', type(x).__name__)}")
+            raise TypeError(
+                "x must be a float32 or float64 tensor, got "
+                f"{getattr(x, 'dtype', type(x).__name__)}"
+            )
         if x.dim() < self.axes:
-            raise ValueError(f"the prior needs a volume of {self.axes} axes, got shape {tuple(x.shape)}")
+            raise ValueError(
+                f"the prior needs a volume of {self.axes} axes, got shape {tuple(x.shape)}"
+            )
         for name, other in others.items():
             if not isinstance(other, Tensor) or (other.dtype, other.device) != (x.dtype, x.device):
-                kind = f"{other.dtype} on {other.device}" if isinstance(other, Tensor) else type(other).__name__
-                raise TypeError(f"{name} must be a tensor like x, {x.dtype} on {x.device}, got {kind}")
+                kind = (
+                    f"{other.dtype} on {other.device}"
+                    if isinstance(other, Tensor)
+                    else type(other).__name__
+                )
+                raise TypeError(
+                    f"{name} must be a tensor like x, {x.dtype} on {x.device}, got {kind}"
+                )
             if other.shape != x.shape:
-                raise ValueError(f"{name} must have the shape of x, {tuple(x.shape)}, got {tuple(other.shape)}")
+                raise ValueError(
+                    f"{name} must have the shape of x, {tuple(x.shape)}, got {tuple(other.shape)}"
+                )
 
     def gradients(self, x: Tensor) -> Iterator[Tensor]:
-        """Gradient of every pair in HU/mm, one tensor per entry of :attr:`offsets`; of channels its length,
-        ``(..., 1, *pairs)``."""
+        """Gradient of every pair in HU/mm, one tensor per entry of :attr:`offsets`; of channels its
+        length, ``(..., 1, *pairs)``."""
         self._check(x)
         for step, d, _ in self.offsets:
             a, b = _pair(x, step)
-            change = torch.linalg.vector_norm(a - b, dim=-self.axes, keepdim=True) if self.channels else a - b
+            change = (
+                torch.linalg.vector_norm(a - b, dim=-self.axes, keepdim=True)
+                if self.channels
+                else a - b
+            )
             yield change / (self.mu_per_hu * d)
 
     def value(self, x: Tensor) -> Tensor:
@@ -253,9 +293,11 @@ class BoundPrior:
         ]
 
     def majorizer(self, x: Tensor, direction: Tensor) -> Tensor:
-        """Curvature matrix of the parabola that touches R at x and lies above it, times ``direction``.
+        """Curvature matrix of the parabola that touches R at x and lies above it, times
+        ``direction``.
 
-        ``majorizer(x, x)`` is the gradient. Not differentiable (both passes run in numba on the CPU).
+        ``majorizer(x, x)`` is the gradient. Not differentiable (both passes run in numba on the
+        CPU).
 
         Raises:
             ValueError: a direction of another shape than x, fewer axes than a volume has.
@@ -332,17 +374,28 @@ class BoundPrior:
             kind = 1 if self.p == 2.0 and power == 1.0 else 2
         inverse = 1.0 / self._finite
         form = np.array([inverse, power, self.q / self.p, self.p - 2.0, ROUNDING], dtype=dtype)
-        return np.array(steps, dtype=np.int64), np.array(scales, dtype), np.array(factors, dtype), kind, form
+        return (
+            np.array(steps, dtype=np.int64),
+            np.array(scales, dtype),
+            np.array(factors, dtype),
+            kind,
+            form,
+        )
 
     def spectrum(self, shape: Sequence[int]) -> Tensor:
-        """Eigenvalues of the curvature at t = 0 on a periodic grid, ``rfftn`` layout ``(..., shape[-1] // 2 + 1)``."""
+        """Eigenvalues of the curvature at t = 0 on a periodic grid, ``rfftn`` layout ``(...,
+        shape[-1] // 2 + 1)``."""
         n, dtype = len(shape), torch.float64
-        grids = [torch.fft.fftfreq(k, dtype=dtype) for k in shape[:-1]] + [torch.fft.rfftfreq(shape[-1], dtype=dtype)]
+        grids = [torch.fft.fftfreq(k, dtype=dtype) for k in shape[:-1]] + [
+            torch.fft.rfftfreq(shape[-1], dtype=dtype)
+        ]
         mesh = torch.meshgrid(*grids, indexing="ij")
         total = torch.zeros(mesh[0].shape, dtype=dtype)
         at_zero = 1.0 if self.p == 2.0 else ROUNDING ** (self.p - 2)
         for step, d, omega in self.offsets:
-            phase = sum((2 * math.pi * mesh[a] * step[a] for a in range(n)), torch.zeros_like(mesh[0]))
+            phase = sum(
+                (2 * math.pi * mesh[a] * step[a] for a in range(n)), torch.zeros_like(mesh[0])
+            )
             total = total + (omega / d**2) * (2 - 2 * torch.cos(phase))
         return total * (self.lam * self._volume * at_zero / self.mu_per_hu**2)
 

@@ -1,12 +1,13 @@
-"""CPU kernels of the q-GGMRF: the passes of :class:`recon.least_squares.qggmrf.BoundPrior`, fused over all neighbours.
+"""CPU kernels of the q-GGMRF: the passes of :class:`recon.least_squares.qggmrf.BoundPrior`, fused
+over all neighbours.
 
-The curvature formula is that of ``BoundPrior.curvature``, to which the tests compare these kernels. Rows of voxels are
-independent of each other in every pass, so results do not depend on the number of threads; ``begin … end`` of
-``batch · nz · ny`` are worked on. Inner loops run over slices with unsigned indices and without branches (one loop for
-each kind of potential), so that they vectorise.
+The curvature formula is that of ``BoundPrior.curvature``, to which the tests compare these kernels.
+Rows of voxels are independent of each other in every pass, so results do not depend on the number
+of threads; ``begin … end`` of ``batch · nz · ny`` are worked on. Inner loops run over slices with
+unsigned indices and without branches (one loop for each kind of potential), so that they vectorise.
 
-Of several channels the curvature of the length of their difference is written to a buffer first and serves them all; a
-single one, which would take 5 to 14 % longer that way, does without.
+Of several channels the curvature of the length of their difference is written to a buffer first and
+serves them all; a single one, which would take 5 to 14 % longer that way, does without.
 """
 
 from __future__ import annotations
@@ -19,8 +20,15 @@ from numba import njit
 __all__ = ["along", "majorize"]
 
 _FLAGS = {"contract", "reassoc", "arcp", "nsz"}
-# Kernels that allocate nothing need no reference counts, which took a fifth of the time: one for every row's slice.
-_VIEWS_ONLY: Any = {"nogil": True, "cache": True, "fastmath": _FLAGS, "error_model": "numpy", "_nrt": False}
+# Kernels that allocate nothing need no reference counts, which took a fifth of the time: one for
+# every row's slice.
+_VIEWS_ONLY: Any = {
+    "nogil": True,
+    "cache": True,
+    "fastmath": _FLAGS,
+    "error_model": "numpy",
+    "_nrt": False,
+}
 
 
 @njit(inline="always")
@@ -59,7 +67,9 @@ def _add_pull(x0, x1, v0, v1, scale, factor, kind, form, to):
     else:
         for j in range(n):
             i = np.uint64(j)
-            to[i] += factor * _general(abs((x0[i] - x1[i]) * scale) * form[0], form) * (v0[i] - v1[i])
+            to[i] += (
+                factor * _general(abs((x0[i] - x1[i]) * scale) * form[0], form) * (v0[i] - v1[i])
+            )
 
 
 @njit(inline="always")
@@ -93,7 +103,8 @@ def _two_sums(x0, x1, u0, u1, v0, v1, scale, kind, form):
 
 @njit(inline="always")
 def _curvatures(x0, x1, scale, factor, kind, form, out):
-    """out = factor · ρ'(t)/t for every voxel of a row, t = scale · |x0 − x1|; x0, x1 ``(channels, n)``."""
+    """out = factor · ρ'(t)/t for every voxel of a row, t = scale · |x0 − x1|; x0, x1
+    ``(channels, n)``."""
     n = out.size
     if kind == 0:
         out[:] = factor
@@ -130,17 +141,33 @@ def _majorize(begin, end, x, v, steps, scales, factors, kind, form, out, work):
             low, high = max(0, -dx), nx - max(0, dx)
             if channels == 1:
                 _add_pull(
-                    x[n, 0, z, y, low:high], x[n, 0, z1, y1, low + dx : high + dx],
-                    v[n, 0, z, y, low:high], v[n, 0, z1, y1, low + dx : high + dx],
-                    scales[k], factors[k], kind, form, out[n, 0, z, y, low:high],
-                )  # fmt: skip
+                    x[n, 0, z, y, low:high],
+                    x[n, 0, z1, y1, low + dx : high + dx],
+                    v[n, 0, z, y, low:high],
+                    v[n, 0, z1, y1, low + dx : high + dx],
+                    scales[k],
+                    factors[k],
+                    kind,
+                    form,
+                    out[n, 0, z, y, low:high],
+                )
                 continue
             w = work[low:high]
             _curvatures(
-                x[n, :, z, y, low:high], x[n, :, z1, y1, low + dx : high + dx], scales[k], factors[k], kind, form, w
+                x[n, :, z, y, low:high],
+                x[n, :, z1, y1, low + dx : high + dx],
+                scales[k],
+                factors[k],
+                kind,
+                form,
+                w,
             )
             for c in range(channels):
-                v0, v1, to = v[n, c, z, y, low:high], v[n, c, z1, y1, low + dx : high + dx], out[n, c, z, y, low:high]
+                v0, v1, to = (
+                    v[n, c, z, y, low:high],
+                    v[n, c, z1, y1, low + dx : high + dx],
+                    out[n, c, z, y, low:high],
+                )
                 for j in range(high - low):
                     i = np.uint64(j)
                     to[i] += w[i] * (v0[i] - v1[i])
@@ -148,17 +175,21 @@ def _majorize(begin, end, x, v, steps, scales, factors, kind, form, out, work):
 
 @njit(nogil=True, cache=True, fastmath=_FLAGS, error_model="numpy")
 def majorize(begin, end, x, v, steps, scales, factors, kind, form, out):
-    """out = Σ_neighbours factor · ρ'(t)/t · (v_j − v_k); t = scale · length of x_j − x_k over the channels.
+    """out = Σ_neighbours factor · ρ'(t)/t · (v_j − v_k); t = scale · length of x_j − x_k over the
+    channels.
 
     Args:
         x, v: ``(batch, channels, nz, ny, nx)`` contiguous.
         steps: ``(neighbours, 3)`` int64, ALL neighbours (both signs).
-        scales, factors: ``(neighbours,)`` in the dtype of x: 1 / (mu_per_hu d) and λ V ω / (mu_per_hu d)².
+        scales, factors: ``(neighbours,)`` in the dtype of x: 1 / (mu_per_hu d) and λ V ω /
+            (mu_per_hu d)².
         kind: 0 quadratic, 1 p = 2 and q = 1 (no powers), 2 general.
         form: ``(5,)`` in the dtype of x: 1 / T, p − q, q / p, p − 2, ε / T.
         out: like x.
     """
-    _majorize(begin, end, x, v, steps, scales, factors, kind, form, out, np.empty(x.shape[-1], x.dtype))
+    _majorize(
+        begin, end, x, v, steps, scales, factors, kind, form, out, np.empty(x.shape[-1], x.dtype)
+    )
 
 
 @njit(**_VIEWS_ONLY)
@@ -175,17 +206,28 @@ def _along(begin, end, x, u, v, steps, scales, factors, kind, form, out, work):
             low, high = max(0, -dx), nx - max(0, dx)
             if channels == 1:
                 a, b = _two_sums(
-                    x[n, 0, z, y, low:high], x[n, 0, z1, y1, low + dx : high + dx],
-                    u[n, 0, z, y, low:high], u[n, 0, z1, y1, low + dx : high + dx],
-                    v[n, 0, z, y, low:high], v[n, 0, z1, y1, low + dx : high + dx],
-                    scales[k], kind, form,
-                )  # fmt: skip
+                    x[n, 0, z, y, low:high],
+                    x[n, 0, z1, y1, low + dx : high + dx],
+                    u[n, 0, z, y, low:high],
+                    u[n, 0, z1, y1, low + dx : high + dx],
+                    v[n, 0, z, y, low:high],
+                    v[n, 0, z1, y1, low + dx : high + dx],
+                    scales[k],
+                    kind,
+                    form,
+                )
                 first += factors[k] * a
                 second += factors[k] * b
                 continue
             w = work[low:high]
             _curvatures(
-                x[n, :, z, y, low:high], x[n, :, z1, y1, low + dx : high + dx], scales[k], factors[k], kind, form, w
+                x[n, :, z, y, low:high],
+                x[n, :, z1, y1, low + dx : high + dx],
+                scales[k],
+                factors[k],
+                kind,
+                form,
+                w,
             )
             for c in range(channels):
                 x0, x1 = x[n, c, z, y, low:high], x[n, c, z1, y1, low + dx : high + dx]
@@ -205,11 +247,14 @@ def _along(begin, end, x, u, v, steps, scales, factors, kind, form, out, work):
 
 @njit(nogil=True, cache=True, fastmath=_FLAGS, error_model="numpy")
 def along(begin, end, x, u, v, steps, scales, factors, kind, form, out):
-    """Row sums of the two inner products ⟨v, M(x) x⟩ and ⟨v, M(x) u⟩, M the matrix of :func:`majorize`.
+    """Row sums of the two inner products ⟨v, M(x) x⟩ and ⟨v, M(x) u⟩, M the matrix of
+    :func:`majorize`.
 
     Args:
         steps, scales, factors: HALF of the neighbours.
         out: ``(batch, nz, ny, 2)`` float64.
         x, u, v, kind, form: as in :func:`majorize`.
     """
-    _along(begin, end, x, u, v, steps, scales, factors, kind, form, out, np.empty(x.shape[-1], x.dtype))
+    _along(
+        begin, end, x, u, v, steps, scales, factors, kind, form, out, np.empty(x.shape[-1], x.dtype)
+    )

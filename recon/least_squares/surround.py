@@ -1,14 +1,16 @@
-"""What lies around an inset when nobody knows it: found by a coarse FBP of the whole field, and taken off the data.
+"""What lies around an inset when nobody knows it: found by a coarse FBP of the whole field, and
+taken off the data.
 
 The readings of the inset's footprint hold the patient too. Their line integrals are split as
 
     y = A x + (y_coarse of what the inset does not hold) + noise,
 
-with a full-field FBP on voxels that are a whole multiple of the inset's, so that the part inside the inset can be put
-back voxel by voxel (what remains of an interior problem after the outside is known; Ziegler, Nielsen, Grass 2008, Med.
-Phys. 35:1317). Coarse voxels carry the low frequencies of the noise of the whole field, and they alone: high ones stay
-with their readings, as the weights of PWLS assume. A second FBP, on larger voxels still, adds what the first does not
-explain. Along z the readings are extended by the outermost rows. It takes views enough for its voxels, about 1500 for a
+with a full-field FBP on voxels that are a whole multiple of the inset's, so that the part inside
+the inset can be put back voxel by voxel (what remains of an interior problem after the outside is
+known; Ziegler, Nielsen, Grass 2008, Med. Phys. 35:1317). Coarse voxels carry the low frequencies of
+the noise of the whole field, and they alone: high ones stay with their readings, as the weights of
+PWLS assume. A second FBP, on larger voxels still, adds what the first does not explain. Along z the
+readings are extended by the outermost rows. It takes views enough for its voxels, about 1500 for a
 thorax: with 246 the details of the inset leak into its own surround (10 HU at the edge of a lumen).
 """
 
@@ -31,14 +33,15 @@ from torchpcct.projector import Projector
 
 __all__ = ["CELL_MM", "UnknownSurround", "length_unit"]
 
-# The scanner on which lengths were chosen, that of the paper: detector cell at the axis, radius of the field of view,
-# mm.
-CELL_MM, FIELD_MM = 0.35 * 626.0 / 1098.0, 626.0 * math.sin(0.35 * 1500 / 2 / 1098.0)
-# Voxels of the whole field, and its detector cells at the axis, in mm: about 1 lp/mm. On other scanners so many times
-# as large as the field of view is, and not less than a cell.
+# The scanner on which lengths were chosen, that of the paper: detector cell at the axis, radius of
+# the field of view, mm.
+CELL_MM = 0.35 * 626.0 / 1098.0
+FIELD_MM = 626.0 * math.sin(0.35 * 1500 / 2 / 1098.0)
+# Voxels of the whole field, and its detector cells at the axis, in mm: about 1 lp/mm. On other
+# scanners so many times as large as the field of view is, and not less than a cell.
 COARSE_MM = 0.6
-# The second FBP, which adds what the first does not explain, does with so much larger ones in the plane: cupping and
-# steps at the ends, no details.
+# The second FBP, which adds what the first does not explain, does with so much larger ones in the
+# plane: cupping and steps at the ends, no details.
 SECOND = 2
 # Rows are joined to about this height at the axis, in mm, likewise: patients change slowly along z.
 COARSE_ROW_MM = 1.5
@@ -49,8 +52,9 @@ TIE = 1e-9
 def length_unit(geometry: ConeBeam) -> float:
     """How many times as large the detector cells at the axis are as those of :data:`CELL_MM`.
 
-    What was chosen in mm for an inset, the default prior, is taken so many times as large: a scan with all lengths
-    times any number, in another unit or of a smaller scanner, gives the same image.
+    What was chosen in mm for an inset, the default prior, is taken so many times as large: a scan
+    with all lengths times any number, in another unit or of a smaller scanner, gives the same
+    image.
     """
     return geometry.pitch[1] / geometry.magnification / CELL_MM
 
@@ -68,21 +72,27 @@ class UnknownSurround:
         coarse: the grid of the whole field.
     """
 
-    def __init__(self, geometry: ConeBeam, grid: VolumeGrid, window: DetectorWindow, projector: Projector) -> None:
+    def __init__(
+        self, geometry: ConeBeam, grid: VolumeGrid, window: DetectorWindow, projector: Projector
+    ) -> None:
         self.geometry, self.grid, self.window, self.projector = geometry, grid, window, projector
         self._all = DetectorWindow.full(geometry)
-        self._first, self._second = (_Field(geometry, grid, size) for size in (COARSE_MM, SECOND * COARSE_MM))
+        self._first, self._second = (
+            _Field(geometry, grid, size) for size in (COARSE_MM, SECOND * COARSE_MM)
+        )
         self.coarse = self._first.grid
         self._left = Projector(self._second.inner, self.coarse)
         self._around = Projector(geometry, self.coarse, window)
         self._last: tuple[bytes, Tensor] | None = None
 
     def volume(self, lines: Tensor) -> Tensor:
-        """The whole field without the inset's details, ``coarse.shape`` mm⁻¹, from line integrals of all cells.
+        """The whole field without the inset's details, ``coarse.shape`` mm⁻¹, from line integrals
+        of all cells.
 
-        Coarse voxels and joined rows would smear the details beyond the inset, and they would be taken off its own
-        readings: a fine FBP of the inset, less the mean along its sides, is taken off first. (Less its own mean, the
-        step that is left at its sides would be smeared: 2.4 HU of a ball in fat.)
+        Coarse voxels and joined rows would smear the details beyond the inset, and they would be
+        taken off its own readings: a fine FBP of the inset, less the mean along its sides, is taken
+        off first. (Less its own mean, the step that is left at its sides would be smeared: 2.4 HU
+        of a ball in fat.)
 
         The last volume is kept: the level of a scan and its own readings need the same.
 
@@ -94,8 +104,10 @@ class UnknownSurround:
             return self._last[1]
         if any(cut_off(lines, self.geometry, angular_weights(self.geometry))):
             raise ValueError(
-                "the rows end inside the object: what lies beyond the field of view cannot be taken off the inset's "
-                "readings (250 HU of a thorax were left); use fbp with outside=, or a detector that holds the body"
+                "the rows end inside the object: what lies beyond the field of view cannot be "
+                "taken off the inset's "
+                "readings (250 HU of a thorax were left); use fbp with outside=, or a detector "
+                "that holds the body"
             )
         fine = fbp(lines, self.geometry, self.grid)
         around = lines.clone()
@@ -137,7 +149,8 @@ class _Field:
 
     Args:
         geometry: of the whole scan.
-        inset: grid of the inset: the voxels are a whole multiple of its own, and one corner is its first one.
+        inset: grid of the inset: the voxels are a whole multiple of its own, and one corner is its
+            first one.
         size: mm, of voxels and cells in the plane of the scanner of the paper.
 
     Attributes:
@@ -150,7 +163,8 @@ class _Field:
         scale = g.sdd / g.sod
         share = g.fov_radius / FIELD_MM
         self._coarse_row, size = (
-            max(length * share, pitch / scale) for length, pitch in zip((COARSE_ROW_MM, size), g.pitch, strict=True)
+            max(length * share, pitch / scale)
+            for length, pitch in zip((COARSE_ROW_MM, size), g.pitch, strict=True)
         )
         self._views = _joined_views(g, size)
         self._bin = (
@@ -158,11 +172,15 @@ class _Field:
             max(_rounded(size * scale / g.pitch[1]), 1),
         )
         # Rows and columns that do not fill a bin are left out, as many at either end as the other.
-        self._skip = tuple((n % b) // 2 for n, b in zip((g.rows, g.columns), self._bin, strict=True))
+        self._skip = tuple(
+            (n % b) // 2 for n, b in zip((g.rows, g.columns), self._bin, strict=True)
+        )
         rows, columns = (n // b for n, b in zip((g.rows, g.columns), self._bin, strict=True))
         pitch = tuple(p * b for p, b in zip(g.pitch, self._bin, strict=True))
         angles = g.angles.reshape(-1, self._views).mean(1)
-        self.inner = ConeBeam(angles, g.sod, g.sdd, columns, rows, pitch, self._offset(g, rows, columns), g.detector)
+        self.inner = ConeBeam(
+            angles, g.sod, g.sdd, columns, rows, pitch, self._offset(g, rows, columns), g.detector
+        )
         # Half the height in mm that the rays of the detector reach inside the field of view.
         edge = max(abs(g.row_positions[0]), abs(g.row_positions[-1])) + g.pitch[0] / 2
         half_height = edge * (g.sod + g.fov_radius) / g.sdd
@@ -175,25 +193,36 @@ class _Field:
         """Where the middle of the joined cells lies."""
         found = []
         for at, first, count, join in zip(
-            (g.row_positions, g.column_positions), self._skip, (rows, columns), self._bin, strict=True
+            (g.row_positions, g.column_positions),
+            self._skip,
+            (rows, columns),
+            self._bin,
+            strict=True,
         ):
             found.append(float((at[first] + at[first + count * join - 1]) / 2))
         return found[0], found[1]
 
     def _whole_multiple(self, inset: VolumeGrid, size: float, half_height: float) -> VolumeGrid:
         shape, spacing, center = [], [], []
-        for axis, (n, h, c) in enumerate(zip(inset.shape, inset.spacing, inset.center, strict=True)):
-            wanted, reach = (self._coarse_row, half_height) if axis == 0 else (size, self.inner.fov_radius)
+        for axis, (n, h, c) in enumerate(
+            zip(inset.shape, inset.spacing, inset.center, strict=True)
+        ):
+            wanted, reach = (
+                (self._coarse_row, half_height) if axis == 0 else (size, self.inner.fov_radius)
+            )
             coarse = h * max(_rounded(wanted / h), 1)
             corner = c - n * h / 2
-            before, after = (math.ceil(way / coarse - TIE) for way in (corner + reach, reach - corner))
+            before, after = (
+                math.ceil(way / coarse - TIE) for way in (corner + reach, reach - corner)
+            )
             shape.append(before + after)
             spacing.append(coarse)
             center.append(corner + (after - before) * coarse / 2)
         return VolumeGrid(tuple(shape), tuple(spacing), tuple(center))
 
     def joined(self, lines: Tensor) -> Tensor:
-        """Line integrals of the whole detector in joined views on the joined one, ``(views, rows, columns)``."""
+        """Line integrals of the whole detector in joined views on the joined one, ``(views,
+        rows, columns)``."""
         rows, columns = self.inner.rows, self.inner.columns
         (r, c), (br, bc) = self._skip, self._bin
         kept = lines[:, r : r + rows * br, c : c + columns * bc]
@@ -202,9 +231,12 @@ class _Field:
     def fbp(self, data: Tensor, outside: float | None = None) -> Tensor:
         """Volume ``grid.shape`` in mm⁻¹ of joined readings, rows extended by the outermost.
 
-        ``outside`` as for :func:`recon.analytic.fbp.fbp`: 0 for a residual, which has no edge to be continued.
+        ``outside`` as for :func:`recon.analytic.fbp.fbp`: 0 for a residual, which has no edge to be
+        continued.
         """
-        extended = torch.cat([data[:, :1]] * self._extra + [data] + [data[:, -1:]] * self._extra, dim=1)
+        extended = torch.cat(
+            [data[:, :1]] * self._extra + [data] + [data[:, -1:]] * self._extra, dim=1
+        )
         return torch.nan_to_num(fbp(extended, self._extended, self.grid, outside=outside))
 
 
@@ -214,21 +246,32 @@ def _rounded(value: float) -> int:
 
 
 def _joined_views(g: ConeBeam, size: float) -> int:
-    """How many neighbouring views are joined: as many as leave those that voxels of ``size`` mm in the field need."""
+    """How many neighbouring views are joined: as many as leave those that voxels of ``size`` mm
+    in the field need."""
     if g.views < 2:
         return 1
     steps = np.diff(g.angles)
     if not np.allclose(steps, steps.mean(), rtol=0.0, atol=1e-6):
         return 1
-    needed = 0.9 * math.pi * g.fov_radius / size * (g.angles[-1] - g.angles[0] + steps.mean()) / (2 * math.pi)
+    needed = (
+        0.9
+        * math.pi
+        * g.fov_radius
+        / size
+        * (g.angles[-1] - g.angles[0] + steps.mean())
+        / (2 * math.pi)
+    )
     most = max(int(g.views / max(abs(needed), 1.0)), 1)
     return max(k for k in range(1, most + 1) if g.views % k == 0)
 
 
 def resampled(volume: Tensor, grid: VolumeGrid, onto: VolumeGrid) -> Tensor:
-    """A volume ``grid.shape`` at the voxels of another grid: each takes the voxel that holds its centre."""
+    """A volume ``grid.shape`` at the voxels of another grid: each takes the voxel that holds its
+    centre."""
     for axis, (at, own, h) in enumerate(zip(onto.axes, grid.axes, grid.spacing, strict=True)):
-        index = np.clip(np.floor((at - own[0]) / h + 0.5), 0, volume.shape[axis] - 1).astype(np.int64)
+        index = np.clip(np.floor((at - own[0]) / h + 0.5), 0, volume.shape[axis] - 1).astype(
+            np.int64
+        )
         volume = volume.index_select(axis, torch.from_numpy(index))
     return volume
 

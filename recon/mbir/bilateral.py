@@ -1,12 +1,14 @@
-"""The joint bilateral filter as a differentiable layer: a mean over the neighbours that look alike in a guide.
+"""The joint bilateral filter as a differentiable layer: a mean over the neighbours that look alike
+in a guide.
 
     out_i = Σ_j s(i − j) ρ((g_j − g_i) / t) u_j / Σ_j s(i − j) ρ((g_j − g_i) / t)
 
-s is a Gaussian in space, ρ(x) = (1 − x²/4)² within ``|x| < 2`` and 0 beyond (Tukey's biweight; about exp(−x²/2), at a
-fraction of its cost). Constants pass through, a turned volume gives the turned result, and a neighbour beyond an edge
-of the guide does not count at all: so edges keep their place and height, and no voxel is pushed beyond its neighbours.
-After FBP it is the strongest simple filter for plaques (:mod:`recon.filters`); here it is one of the network's
-views of the data (:mod:`recon.mbir.network`).
+s is a Gaussian in space, ρ(x) = (1 − x²/4)² within ``|x| < 2`` and 0 beyond (Tukey's biweight;
+about exp(−x²/2), at a fraction of its cost). Constants pass through, a turned volume gives the
+turned result, and a neighbour beyond an edge of the guide does not count at all: so edges keep
+their place and height, and no voxel is pushed beyond its neighbours. After FBP it is the strongest
+simple filter for plaques (:mod:`recon.filters`); here it is one of the network's views of the data
+(:mod:`recon.mbir.network`).
 """
 
 from __future__ import annotations
@@ -71,7 +73,8 @@ def _forward(begin, end, u, g, scale, offsets, weights, out, total):
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _backward(begin, end, u, g, scale, offsets, weights, out, total, grad, grad_u, grad_g):
-    """Gradients by volume and guide, gathered: what row ``begin … end`` gives to others, and they to it."""
+    """Gradients by volume and guide, gathered: what row ``begin … end`` gives to others, and
+    they to it."""
     nz, ny, nx = u.shape[1:]
     for row in range(begin, end):
         b, z, y = row // (nz * ny), row // ny % nz, row % ny
@@ -100,7 +103,9 @@ def _backward(begin, end, u, g, scale, offsets, weights, out, total, grad, grad_
 
 class _Bilateral(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, u: Tensor, guide: Tensor, threshold: Tensor, reach: float, step: int) -> Tensor:
+    def forward(
+        ctx: Any, u: Tensor, guide: Tensor, threshold: Tensor, reach: float, step: int
+    ) -> Tensor:
         values, g = (v.detach().float().contiguous() for v in (u, guide))
         # Where there is no noise (and so no threshold) every difference is an edge.
         scale = 1.0 / threshold.detach().float().clamp_min(_LEAST)
@@ -108,15 +113,26 @@ class _Bilateral(torch.autograd.Function):
         if u.device.type == "cuda":
             from recon.mbir import bilateral_triton  # where there is a GPU
 
-            near = torch.from_numpy(offsets).int().to(u.device), torch.from_numpy(weights).to(u.device)
+            near = (
+                torch.from_numpy(offsets).int().to(u.device),
+                torch.from_numpy(weights).to(u.device),
+            )
             out, total = bilateral_triton.forward(values, g, scale, *near)
             ctx.kept = (values, g, scale, *near, out, total, u.dtype)
             return out.to(u.dtype)
         out, total = torch.empty_like(values), torch.empty_like(values)
         rows = math.prod(values.shape[:3])
         given = [v.numpy() for v in (values, g, scale)]
-        run(_forward, rows, *given, offsets, weights, out.numpy(), total.numpy(),
-            operations=8 * len(weights) * values.shape[3])  # fmt: skip
+        run(
+            _forward,
+            rows,
+            *given,
+            offsets,
+            weights,
+            out.numpy(),
+            total.numpy(),
+            operations=8 * len(weights) * values.shape[3],
+        )
         ctx.kept = (values, g, scale, offsets, weights, out, total, u.dtype)
         return out.to(u.dtype)
 
@@ -133,24 +149,35 @@ class _Bilateral(torch.autograd.Function):
             rows = math.prod(values.shape[:3])
             given = [v.numpy() for v in (values, g, scale)]
             kept = [v.numpy() for v in (out, total, slope, *found)]
-            run(_backward, rows, *given, offsets, weights, *kept,
-                operations=20 * len(weights) * values.shape[3])  # fmt: skip
+            run(
+                _backward,
+                rows,
+                *given,
+                offsets,
+                weights,
+                *kept,
+                operations=20 * len(weights) * values.shape[3],
+            )
         return (*(f.to(dtype) for f in found), None, None, None)
 
 
-def joint_bilateral(u: Tensor, guide: Tensor, threshold: Tensor, reach: float = 2.5, step: int = 1) -> Tensor:
-    """Filtered volumes ``(batch, z, y, x)``, differentiable in volume and guide; in float32, on the device of ``u``.
+def joint_bilateral(
+    u: Tensor, guide: Tensor, threshold: Tensor, reach: float = 2.5, step: int = 1
+) -> Tensor:
+    """Filtered volumes ``(batch, z, y, x)``, differentiable in volume and guide; in float32, on the
+    device of ``u``.
 
     Args:
         u: volumes.
         guide: of the same shape, smooth enough that its differences tell of edges and not of noise.
         threshold: ``(batch,)`` differences of the guide that weigh about exp(−½) (t above).
         reach: standard deviation of s in voxels; it ends at twice that.
-        step: only every so many voxels along each axis are neighbours: of smooth volumes the others add nothing.
+        step: only every so many voxels along each axis are neighbours: of smooth volumes the others
+            add nothing.
 
     Raises:
-        ValueError: volumes that have not four axes, a guide or thresholds that do not belong to them, a reach ≤ 0, a
-            step < 1.
+        ValueError: volumes that have not four axes, a guide or thresholds that do not belong to
+            them, a reach ≤ 0, a step < 1.
     """
     shaped("u", u, (None, None, None, None))
     shaped("guide", guide, tuple(u.shape))

@@ -1,5 +1,6 @@
 # mypy: ignore-errors
-"""Triton counterparts of the kernels in :mod:`recon.mbir.bilateral` for CUDA: one lane a voxel, sums over neighbours.
+"""Triton counterparts of the kernels in :mod:`recon.mbir.bilateral` for CUDA: one lane a voxel,
+sums over neighbours.
 
 Both passes gather, so there are no atomics and the results are the same bits every time.
 """
@@ -18,15 +19,22 @@ _BLOCK = 256
 
 @triton.jit
 def _neighbour(k, offsets, weights, i, nz, ny, nx, voxels):
-    """How far along the volume neighbour ``k`` of voxels ``i`` lies, whether it is inside, and its weight in space."""
-    dz, dy, dx = tl.load(offsets + 3 * k), tl.load(offsets + 3 * k + 1), tl.load(offsets + 3 * k + 2)
+    """How far along the volume neighbour ``k`` of voxels ``i`` lies, whether it is inside, and
+    its weight in space."""
+    dz, dy, dx = (
+        tl.load(offsets + 3 * k),
+        tl.load(offsets + 3 * k + 1),
+        tl.load(offsets + 3 * k + 2),
+    )
     x, y, z = i % nx + dx, i // nx % ny + dy, i // (nx * ny) + dz
     valid = (i < voxels) & (z >= 0) & (z < nz) & (y >= 0) & (y < ny) & (x >= 0) & (x < nx)
     return (dz * ny + dy) * nx + dx, valid, tl.where(valid, tl.load(weights + k), 0.0)
 
 
 @triton.jit
-def _forward_kernel(u, g, scale, offsets, weights, out, total, nz, ny, nx, voxels, count, BLOCK: tl.constexpr):
+def _forward_kernel(
+    u, g, scale, offsets, weights, out, total, nz, ny, nx, voxels, count, BLOCK: tl.constexpr
+):
     batch = tl.program_id(1)
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < voxels
@@ -51,7 +59,22 @@ def _forward_kernel(u, g, scale, offsets, weights, out, total, nz, ny, nx, voxel
 
 @triton.jit
 def _backward_kernel(
-    u, g, scale, offsets, weights, out, total, grad, grad_u, grad_g, nz, ny, nx, voxels, count, BLOCK: tl.constexpr
+    u,
+    g,
+    scale,
+    offsets,
+    weights,
+    out,
+    total,
+    grad,
+    grad_u,
+    grad_g,
+    nz,
+    ny,
+    nx,
+    voxels,
+    count,
+    BLOCK: tl.constexpr,
 ):
     batch = tl.program_id(1)
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -87,7 +110,9 @@ def _arguments(u: Tensor, offsets: Tensor) -> tuple[tuple[int, int], tuple[int, 
     return (triton.cdiv(voxels, _BLOCK), batch), (nz, ny, nx, voxels, len(offsets))
 
 
-def forward(u: Tensor, g: Tensor, scale: Tensor, offsets: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+def forward(
+    u: Tensor, g: Tensor, scale: Tensor, offsets: Tensor, weights: Tensor
+) -> tuple[Tensor, Tensor]:
     """The filtered volumes and the sums of weights, ``(batch, z, y, x)`` float32.
 
     Args:
@@ -102,10 +127,19 @@ def forward(u: Tensor, g: Tensor, scale: Tensor, offsets: Tensor, weights: Tenso
 
 
 def backward(
-    u: Tensor, g: Tensor, scale: Tensor, offsets: Tensor, weights: Tensor, out: Tensor, total: Tensor, grad: Tensor
+    u: Tensor,
+    g: Tensor,
+    scale: Tensor,
+    offsets: Tensor,
+    weights: Tensor,
+    out: Tensor,
+    total: Tensor,
+    grad: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Gradients by volumes and guide, given that by the filtered volumes."""
     grad_u, grad_g = torch.empty_like(u), torch.empty_like(u)
     programs, sizes = _arguments(u, offsets)
-    _backward_kernel[programs](u, g, scale, offsets, weights, out, total, grad, grad_u, grad_g, *sizes, BLOCK=_BLOCK)
+    _backward_kernel[programs](
+        u, g, scale, offsets, weights, out, total, grad, grad_u, grad_g, *sizes, BLOCK=_BLOCK
+    )
     return grad_u, grad_g

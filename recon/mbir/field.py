@@ -2,21 +2,24 @@
 
 Four things differ from an inset (:mod:`recon.mbir.mbir`):
 
-* AᵀWA is applied by the projector itself: the FFT model of an inset does not hold over a whole field.
-* Noise changes over the field. With s(x) = (AᵀW 1 at the middle / AᵀW 1 at x)^½ the problem is solved for
-  u = x / (c s), c the noise scale at the middle. S AᵀWA S has everywhere about the spectrum of the middle (Fessler and
-  Booth 1999, IEEE Trans. Image Process. 8:688), so noise looks to the network as it did in training. But which
-  directions are starved changes from place to place (across the shoulders, along a rib), so that spectrum is averaged
-  over the directions in plane: where it is small in a direction and the true one is not, a step towards the data would
-  be mostly noise.
-* What the inset's surround is there, a strongly regularised PWLS is here: it takes the body's outline, bones and lungs
-  off the data, and the network sees the rest, as in training. It need not converge, the data decide about the sum.
+* AᵀWA is applied by the projector itself: the FFT model of an inset does not hold over a whole
+  field.
+* Noise changes over the field. With s(x) = (AᵀW 1 at the middle / AᵀW 1 at x)^½ the problem is
+  solved for u = x / (c s), c the noise scale at the middle. S AᵀWA S has everywhere about the
+  spectrum of the middle (Fessler and Booth 1999, IEEE Trans. Image Process. 8:688), so noise looks
+  to the network as it did in training. But which directions are starved changes from place to place
+  (across the shoulders, along a rib), so that spectrum is averaged over the directions in plane:
+  where it is small in a direction and the true one is not, a step towards the data would be mostly
+  noise.
+* What the inset's surround is there, a strongly regularised PWLS is here: it takes the body's
+  outline, bones and lungs off the data, and the network sees the rest, as in training. It need not
+  converge, the data decide about the sum.
 * The network sees blocks that overlap, each with its own noise scale as condition.
 
-Voxels: what the network knows is measured in voxels of about a detector cell at the axis. A scan with cells half as
-large is the same scan of an object half as large; lengths are counted in voxels, and grids whose voxels are not within
-``VOXELS_PER_CELL`` of a cell are reconstructed on voxels that are, and averaged. Parallel and fan beams: the slices
-of a stack are one volume.
+Voxels: what the network knows is measured in voxels of about a detector cell at the axis. A scan
+with cells half as large is the same scan of an object half as large; lengths are counted in voxels,
+and grids whose voxels are not within ``VOXELS_PER_CELL`` of a cell are reconstructed on voxels that
+are, and averaged. Parallel and fan beams: the slices of a stack are one volume.
 """
 
 from __future__ import annotations
@@ -52,21 +55,28 @@ if TYPE_CHECKING:
 __all__ = ["FieldGram", "blockwise", "field_solutions", "trained_grid"]
 
 VOXELS_PER_CELL = (0.7, 1.5)
-"""Voxel over detector cell at the axis: the training has 0.2 mm voxels on cells of 0.2 mm × 0.29 mm."""
+"""Voxel over detector cell at the axis: the training has 0.2 mm voxels on cells of 0.2 mm × 0.29
+mm."""
 SOLVES = (16, 10)
 """Conjugate gradients of start and data consistency on exact pairs."""
 LARGEST_RATIO = 4.0
-"""Voxels that rays hardly meet are treated as if their noise were so many times that of the middle."""
-BLOCK, HALO = 64, 16
-SURROUND_STRENGTH, SURROUND_STEP_HU = 10.0, 75.0
-"""Of the PWLS that takes off the edges: strength over that of the default prior, and the step from voxel to voxel above
-which it is one. A threshold that follows the noise would leave a starved scan the outline of the body."""
-SURROUND_HU, SURROUND_PAIRS = 5.0, 60
+"""Voxels that rays hardly meet are treated as if their noise were so many times that of the
+middle."""
+BLOCK = 64
+HALO = 16
+SURROUND_STRENGTH = 10.0
+SURROUND_STEP_HU = 75.0
+"""Of the PWLS that takes off the edges: strength over that of the default prior, and the step from
+voxel to voxel above which it is one. A threshold that follows the noise would leave a starved scan
+the outline of the body."""
+SURROUND_HU = 5.0
+SURROUND_PAIRS = 60
 """Its tolerance, and the most projection pairs."""
 
 
 class FieldGram:
-    """S AᵀWA S of a whole field, in the form that :class:`recon.mbir.problem.NormalisedProblem` asks for.
+    """S AᵀWA S of a whole field, in the form that :class:`recon.mbir.problem.NormalisedProblem`
+    asks for.
 
     Args:
         problem: of the scan.
@@ -83,11 +93,17 @@ class FieldGram:
         A = problem.projector
         model = FieldModel(A, self._weights[len(self._weights) // 2])
         self._middle = float(model.seen[model.at])
-        rest = model.seen[None] if len(self._weights) == 1 else torch.stack([A.T(w) for w in self._weights])
+        rest = (
+            model.seen[None]
+            if len(self._weights) == 1
+            else torch.stack([A.T(w) for w in self._weights])
+        )
         seen = rest if problem.plane else rest[0]
         self.ratio = (self._middle / seen.clamp_min(self._middle / LARGEST_RATIO**2)).sqrt()
         self.determined = model.determined.expand(self.ratio.shape)
-        self._spectrum = _turned(model.spectrum[None] if problem.plane else model.spectrum, self.ratio.shape)
+        self._spectrum = _turned(
+            model.spectrum[None] if problem.plane else model.spectrum, self.ratio.shape
+        )
         self._spectrum *= self._middle
         self._model = model
 
@@ -97,25 +113,30 @@ class FieldGram:
         if not self._problem.plane:
             found: Tensor = A.T(self._weights[0] * A(x))
             return found
-        return torch.stack([A.T(w * A(v)) for v, w in zip(x.unbind(1), self._weights, strict=True)], 1)
+        return torch.stack(
+            [A.T(w * A(v)) for v, w in zip(x.unbind(1), self._weights, strict=True)], 1
+        )
 
     def apply(self, u: Tensor) -> Tensor:
         """S AᵀWA S u, ``(batch, z, y, x)``."""
         return self.ratio * self.exact(self.ratio * u)
 
     def periodic_spectrum(self) -> Tensor:
-        """Eigenvalues of the circulant model at the middle, ``rfftn`` layout; of slices the same at all z."""
+        """Eigenvalues of the circulant model at the middle, ``rfftn`` layout; of slices the same
+        at all z."""
         return self._spectrum
 
     def information(self, mu_per_hu: float, frequency: float = REFERENCE_FREQUENCY) -> float:
-        """So that the noise scale of the middle is right, see :class:`recon.mbir.problem.NormalisedProblem`."""
+        """So that the noise scale of the middle is right, see
+        :class:`recon.mbir.problem.NormalisedProblem`."""
         n = self._model.grid.ndim
         spacing = (self._voxel_mm,) * n
         return self._model.information(mu_per_hu, frequency, spacing) * self._voxel_mm ** (n - 3)
 
 
 def _turned(spectrum: Tensor, shape: Sequence[int]) -> Tensor:
-    """Mean of a spectrum (``rfftn`` layout of volumes of ``shape``) over the directions in plane."""
+    """Mean of a spectrum (``rfftn`` layout of volumes of ``shape``) over the directions in
+    plane."""
     y, x = (torch.fft.fftfreq(n, dtype=torch.float64) for n in shape[-2:])
     radius = torch.hypot(y[:, None], x[: spectrum.shape[-1]].abs()) * min(shape[-2:])
     ring = radius.round().long()
@@ -139,7 +160,8 @@ def trained_grid(grid: VolumeGrid, geometry: Any) -> VolumeGrid:
     """
     if not hasattr(geometry, "pitch"):
         raise ValueError(
-            f'MBIR knows its voxels by the detector cell of a circular scan, got {type(geometry).__name__}: use "pwls"'
+            "MBIR knows its voxels by the detector cell of a circular scan, got "
+            f'{type(geometry).__name__}: use "pwls"'
         )
     pitch = geometry.pitch[1] if isinstance(geometry.pitch, tuple) else geometry.pitch
     cell = pitch / getattr(geometry, "magnification", 1.0)
@@ -147,21 +169,31 @@ def trained_grid(grid: VolumeGrid, geometry: Any) -> VolumeGrid:
     cubic = max(abs(s / h - 1.0) for s in grid.spacing) <= 0.01
     if cubic and VOXELS_PER_CELL[0] <= h / cell <= VOXELS_PER_CELL[1]:
         return grid
-    return VolumeGrid(tuple(max(1, math.ceil(e / cell - 1e-6)) for e in grid.extent), cell, grid.center)
+    return VolumeGrid(
+        tuple(max(1, math.ceil(e / cell - 1e-6)) for e in grid.extent), cell, grid.center
+    )
 
 
 def blockwise(
-    network: Prior, scales: Tensor, estimate: Tensor, towards: Tensor, condition: Tensor, smoothed: Tensor | None,
-    block: int = BLOCK, halo: int = HALO,
-) -> Tensor:  # fmt: skip
-    """The network on volumes ``(1, z, y, x)`` of any size, block by block; neighbours fade into each other.
+    network: Prior,
+    scales: Tensor,
+    estimate: Tensor,
+    towards: Tensor,
+    condition: Tensor,
+    smoothed: Tensor | None,
+    block: int = BLOCK,
+    halo: int = HALO,
+) -> Tensor:
+    """The network on volumes ``(1, z, y, x)`` of any size, block by block; neighbours fade into
+    each other.
 
     Args:
         network: the learned prior, or what stands for it.
         scales: ``(z, y, x)`` noise scale of each voxel, HU: each block is told its own.
         estimate, towards, condition, smoothed: see :meth:`recon.mbir.network.Network.forward`.
-        block: voxels along each axis that a block gives; with those it shares with its neighbours ``2 · halo`` more. A
-            multiple of 8, as ``halo``: blocks of voxels must be those of the whole.
+        block: voxels along each axis that a block gives; with those it shares with its neighbours
+            ``2 · halo`` more. A multiple of 8, as ``halo``: blocks of voxels must be those of the
+            whole.
         halo: voxels on each side that help only, or fade.
     """
     shape = estimate.shape[-3:]
@@ -171,13 +203,20 @@ def blockwise(
         return torch.cat([level.reshape(1, 1).to(condition), condition[:, 1:]], 1)
 
     if max(shape) <= block + 2 * halo:
-        return same_kind(network(estimate, towards, told((slice(None),) * 3), smoothed), estimate, network)
-    total, weight = torch.zeros_like(estimate), torch.zeros(shape, dtype=estimate.dtype, device=estimate.device)
+        return same_kind(
+            network(estimate, towards, told((slice(None),) * 3), smoothed), estimate, network
+        )
+    total, weight = (
+        torch.zeros_like(estimate),
+        torch.zeros(shape, dtype=estimate.dtype, device=estimate.device),
+    )
     for part in _parts(shape, block, halo):
         here: Any = (..., *part)
         seen = estimate[here]
         out = same_kind(
-            network(seen, towards[here], told(part), None if smoothed is None else smoothed[here]), seen, network
+            network(seen, towards[here], told(part), None if smoothed is None else smoothed[here]),
+            seen,
+            network,
         )
         fade = torch.ones((), dtype=estimate.dtype, device=estimate.device)
         for axis, (s, n) in enumerate(zip(part, shape, strict=True)):
@@ -189,15 +228,21 @@ def blockwise(
 
 def _parts(shape: Sequence[int], block: int, halo: int) -> Iterator[tuple[slice, ...]]:
     return itertools.product(
-        *([slice(max(k - halo, 0), min(k + block + halo, n)) for k in range(0, n, block)] for n in shape)
+        *(
+            [slice(max(k - halo, 0), min(k + block + halo, n)) for k in range(0, n, block)]
+            for n in shape
+        )
     )
 
 
 def _fade(part: slice, n: int, halo: int) -> Tensor:
-    """1 inside, falling linearly over the inner half of the halo; the outer half only helps the network."""
+    """1 inside, falling linearly over the inner half of the halo; the outer half only helps the
+    network."""
     at = torch.arange(part.start, part.stop, dtype=torch.float64)
     low = (at - part.start - halo / 2 + 0.5) / (halo + 1) if part.start > 0 else torch.ones_like(at)
-    high = (part.stop - 1 - at - halo / 2 + 0.5) / (halo + 1) if part.stop < n else torch.ones_like(at)
+    high = (
+        (part.stop - 1 - at - halo / 2 + 0.5) / (halo + 1) if part.stop < n else torch.ones_like(at)
+    )
     return torch.minimum(low, high).clamp(1e-6, 1.0)
 
 
@@ -213,12 +258,12 @@ def field_solutions(
         progress: called with the finished fraction.
 
     Yields:
-        Volumes in HU; the report also holds ``noise_scale_hu`` (10 and 90 % of the voxels), ``voxel_mm`` (of the grid
-        that was worked on).
+        Volumes in HU; the report also holds ``noise_scale_hu`` (10 and 90 % of the voxels),
+        ``voxel_mm`` (of the grid that was worked on).
 
     Raises:
-        ValueError: see :class:`recon.least_squares.field_problem.FieldProblem`; too little memory; voxels finer than
-            what the detector resolves.
+        ValueError: see :class:`recon.least_squares.field_problem.FieldProblem`; too little memory;
+            voxels finer than what the detector resolves.
     """
     flat = len(scans[0].geometry.shape) == 2
     asked = grid.slice if flat and grid.ndim == 3 else grid
@@ -226,14 +271,18 @@ def field_solutions(
     fine, cell = grid.spacing[-1], work.spacing[-1]
     if cell > 1.01 * fine:
         raise ValueError(
-            f"voxels of {fine:g} mm are finer than what the network was trained for on this detector, whose cells have "
-            f"{cell:g} mm at the axis: ask for voxels of {cell:g} mm or more and resample the result, or use "
+            f"voxels of {fine:g} mm are finer than what the network was trained for on this "
+            "detector, whose cells have "
+            f"{cell:g} mm at the axis: ask for voxels of {cell:g} mm or more and resample the "
+            "result, or use "
             'method="pwls"'
         )
     full = work
     if asked is not grid:
         full = VolumeGrid(
-            (grid.shape[0], *work.shape), (grid.spacing[0], *work.spacing), (grid.center[0], *work.center)
+            (grid.shape[0], *work.shape),
+            (grid.spacing[0], *work.spacing),
+            (grid.center[0], *work.center),
         )
     problem = FieldProblem(scans[0], full)
     for i, scan in enumerate(scans):
@@ -255,7 +304,9 @@ def _onto(hu: Tensor, source: VolumeGrid, target: VolumeGrid) -> Tensor:
     """Averages over the voxels of another grid, 2-D or 3-D."""
     if source.ndim == 3:
         return average_onto(hu, source, target)
-    source3, target3 = (VolumeGrid((1, *g.shape), (1.0, *g.spacing), (0.0, *g.center)) for g in (source, target))
+    source3, target3 = (
+        VolumeGrid((1, *g.shape), (1.0, *g.spacing), (0.0, *g.center)) for g in (source, target)
+    )
     return average_onto(hu.unsqueeze(-3), source3, target3).squeeze(-3)
 
 
@@ -271,14 +322,20 @@ def _one(
     b = gram.ratio * _stacked(problem, projected)
     normal = NormalisedProblem.from_statistic(gram, b[None], torch.ones(1), hu, network.voxel_mm)
     scales = normal.scale_hu * gram.ratio
-    # Its noise is known on average over directions only: along a starved one, noise would pass for structure.
+    # Its noise is known on average over directions only: along a starved one, noise would pass for
+    # structure.
     prior = bound(network.parts.get("prior", model.network), normal, normal.spectrum())
-    u = network.with_prior(partial(blockwise, prior, scales)).solution(normal, restore=False, solves=SOLVES)
+    u = network.with_prior(partial(blockwise, prior, scales)).solution(
+        normal, restore=False, solves=SOLVES
+    )
     left = normal.beta - normal.apply(u)
     whole = normal.beta + normal.apply(_stacked(problem, around)[None] / (scales * hu))
     rest = (u[0] * scales) * hu
     found = [x + d for x, d in zip(around, rest if problem.plane else [rest], strict=True)]
-    squares = [(w * (y - A(x)).square()).sum(dtype=torch.float64) for (y, w), x in zip(slices, found, strict=True)]
+    squares = [
+        (w * (y - A(x)).square()).sum(dtype=torch.float64)
+        for (y, w), x in zip(slices, found, strict=True)
+    ]
     readings = sum(int((w > 0).sum()) for _, w in slices)
     seen = scales[gram.determined]
     seen = seen[:: max(1, seen.numel() // 10**6)]
@@ -293,13 +350,18 @@ def _one(
     if network.noisier_or_quieter((low, high)):
         strange.append("another noise than that of its scans")
     if strange:
-        warnings.insert(0, f'the network was not trained for this ({"; ".join(strange)}): use method="pwls"')
+        warnings.insert(
+            0, f'the network was not trained for this ({"; ".join(strange)}): use method="pwls"'
+        )
     report = {
-        "method": "mbir", "iterations": model.steps, "fidelity": network.fidelity,
+        "method": "mbir",
+        "iterations": model.steps,
+        "fidelity": network.fidelity,
         "residual": float(low_residual(replace(normal, beta=whole), left, network.fidelity)),
-        "chi2": float(torch.stack(squares).sum()) / max(readings, 1), "noise_scale_hu": (low, high),
+        "chi2": float(torch.stack(squares).sum()) / max(readings, 1),
+        "noise_scale_hu": (low, high),
         **network.made_with,
-    }  # fmt: skip
+    }
     return found, report, warnings
 
 
@@ -309,18 +371,28 @@ def _stacked(problem: FieldProblem, volumes: Sequence[Tensor]) -> Tensor:
 
 
 def _surround(problem: FieldProblem, slices: Sequence[tuple[Tensor, Tensor]]) -> list[Tensor]:
-    """The edges of each slice in mm⁻¹: PWLS with :data:`SURROUND_STRENGTH` times the strength of the default prior."""
+    """The edges of each slice in mm⁻¹: PWLS with :data:`SURROUND_STRENGTH` times the strength of
+    the default prior."""
     voxel = problem.work.spacing[-1]
     usual = field_prior(voxel, problem.work.ndim)
     prior = replace(
-        usual, strength=SURROUND_STRENGTH * usual.strength, threshold=SURROUND_STEP_HU / voxel, relative=False
+        usual,
+        strength=SURROUND_STRENGTH * usual.strength,
+        threshold=SURROUND_STEP_HU / voxel,
+        relative=False,
     )
     hu = problem.mu_ref / 1000.0
     found = []
     for y, w in slices:
         result = pwls(
-            problem.projector, y, w, prior, mu_per_hu=hu, start=problem.start(y), tolerance=SURROUND_HU,
+            problem.projector,
+            y,
+            w,
+            prior,
+            mu_per_hu=hu,
+            start=problem.start(y),
+            tolerance=SURROUND_HU,
             max_exact=SURROUND_PAIRS,
-        )  # fmt: skip
+        )
         found.append(result.x)
     return found

@@ -1,8 +1,9 @@
-"""Model-based reconstruction with the learned prior: from the scan's statistic AᵀW y to a volume in HU.
+"""Model-based reconstruction with the learned prior: from the scan's statistic AᵀW y to a volume in
+HU.
 
-The network works on cubic voxels of one size (the one it was trained at); other grids are reconstructed on such voxels
-over the same extent and averaged onto the grid that was asked for. Weights and their model card ship in
-``recon/mbir/weights``.
+The network works on cubic voxels of one size (the one it was trained at); other grids are
+reconstructed on such voxels over the same extent and averaged onto the grid that was asked for.
+Weights and their model card ship in ``recon/mbir/weights``.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ class Reconstructed:
     Attributes:
         normal: the normalised problem.
         u: ``(batch, z, y, x)`` in its units.
-        notes: for each volume, what its report shall hold beside; under ``warnings`` a list of texts.
+        notes: for each volume, what its report shall hold beside; under ``warnings`` a list of
+            texts.
     """
 
     normal: NormalisedProblem
@@ -62,8 +64,8 @@ class Mbir:
         fidelity: 0 (viewing) … 1 (measuring), see :mod:`recon.mbir.unrolled`.
         prior: in the place of the model's network: a prior, a denoiser, or a name
             (:func:`recon.mbir.priors.prior_of`); a module goes into evaluation mode.
-        parts: for ablations, ``steps``, ``final_data_consistency``, ``cut_overshoot`` and ``restore`` of
-            :meth:`recon.mbir.unrolled.Unrolled.forward`.
+        parts: for ablations, ``steps``, ``final_data_consistency``, ``cut_overshoot`` and
+            ``restore`` of :meth:`recon.mbir.unrolled.Unrolled.forward`.
 
     Raises:
         ValueError, TypeError: a fidelity outside of 0 … 1; what is no prior.
@@ -93,22 +95,32 @@ class Mbir:
 
     @classmethod
     @undisturbed
-    def load(cls, path: str | Path | None = None, fidelity: float = DEFAULT_FIDELITY, network: Any = None) -> Mbir:
+    def load(
+        cls, path: str | Path | None = None, fidelity: float = DEFAULT_FIDELITY, network: Any = None
+    ) -> Mbir:
         """From a weights file; None: the weights that ship with the package.
 
         Args:
             path: of the file.
             fidelity: as for the class.
-            network: for weights of another network than the package's: its class, ``package.module:Class`` or the class
-                or a module itself (:func:`recon.mbir.priors.network_of`). A file alone imports nothing.
+            network: for weights of another network than the package's: its class,
+                ``package.module:Class`` or the class or a module itself
+                (:func:`recon.mbir.priors.network_of`). A file alone imports nothing.
 
         Raises:
             FileNotFoundError: no such file.
-            ValueError: a file that is damaged or holds no weights of this model; of another network which is not named.
+            ValueError: a file that is damaged or holds no weights of this model; of another network
+                which is not named.
         """
-        source = Path(path) if path is not None else Path(str(resources.files("recon") / "mbir" / "weights" / SHIPPED))
+        source = (
+            Path(path)
+            if path is not None
+            else Path(str(resources.files("recon") / "mbir" / "weights" / SHIPPED))
+        )
         if not source.is_file():
-            raise FileNotFoundError(f"no weights at {source}: train them (torchpcct train) or name a file")
+            raise FileNotFoundError(
+                f"no weights at {source}: train them (torchpcct train) or name a file"
+            )
         foreign = network is not None
         try:
             tensors, config = read_tensors(source, WEIGHTS_FORMAT)
@@ -120,7 +132,8 @@ class Mbir:
             if foreign:
                 raise ValueError(f"{source}: {error}") from error
             raise ValueError(
-                f"{source} holds no weights of this unrolled reconstruction: {error} (shipped weights come back with "
+                f"{source} holds no weights of this unrolled reconstruction: {error} (shipped "
+                "weights come back with "
                 "a new installation of the package)"
             ) from error
         return cls(model, fidelity)
@@ -133,23 +146,32 @@ class Mbir:
     @property
     def made_with(self) -> dict[str, str]:
         """For a report: the weights, or the prior in their place."""
-        return {"prior": self.prior_name} if "prior" in self.parts else {"weights_sha256": self.weights_sha256}
+        return (
+            {"prior": self.prior_name}
+            if "prior" in self.parts
+            else {"weights_sha256": self.weights_sha256}
+        )
 
     @property
     def weights_sha256(self) -> str:
-        """SHA-256 of the weights' names, types, shapes and values, as in the record of their training."""
+        """SHA-256 of the weights' names, types, shapes and values, as in the record of their
+        training."""
         return digest(self.model.state_dict())
 
     def problem(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> NormalisedProblem:
-        """The normalised problem of ``b`` ``(batch, z, y, x)``, AᵀW y with the weights of the exposure."""
+        """The normalised problem of ``b`` ``(batch, z, y, x)``, AᵀW y with the weights of the
+        exposure."""
         spacing = problem.grid.spacing
         if max(abs(s / self.voxel_mm - 1.0) for s in spacing) > 0.01:
             raise ValueError(
-                f"the network works on cubic voxels of {self.voxel_mm:g} mm, got {spacing}: make the problem on "
+                f"the network works on cubic voxels of {self.voxel_mm:g} mm, got {spacing}: make "
+                "the problem on "
                 "recon.mbir.mbir.working_grid and average the result onto the grid"
             )
         exposure = torch.full((b.shape[0],), float(exposure_s))
-        made = NormalisedProblem.from_statistic(problem.gram, b, exposure, problem.mu_ref / 1000.0, self.voxel_mm)
+        made = NormalisedProblem.from_statistic(
+            problem.gram, b, exposure, problem.mu_ref / 1000.0, self.voxel_mm
+        )
         level = torch.tensor(problem.level, dtype=torch.float64)
         return replace(made, zero_hu=float(to_hu(level, problem.mu_ref)))
 
@@ -159,7 +181,8 @@ class Mbir:
 
         Args:
             problem: of the scan, on voxels of ``voxel_mm``.
-            b: ``(batch, z, y, x)``, :meth:`recon.least_squares.inset_problem.InsetProblem.statistic` of each scan.
+            b: ``(batch, z, y, x)``,
+                :meth:`recon.least_squares.inset_problem.InsetProblem.statistic` of each scan.
             exposure_s: of the scans.
         """
         found = self.solved(problem, b, exposure_s)
@@ -179,7 +202,8 @@ class Mbir:
             parts: arguments of the model that those of this method go before.
 
         Raises:
-            ValueError, TypeError: the prior returns NaN, or something else than a volume like the one that it is given.
+            ValueError, TypeError: the prior returns NaN, or something else than a volume like the
+                one that it is given.
         """
         sound = True
 
@@ -189,7 +213,8 @@ class Mbir:
             sound = sound and not bad
             if bad and step:
                 raise ValueError(
-                    f"the prior {self.prior_name} returned NaN or infinite values in {bad} of {v.numel()} voxels: use "
+                    f"the prior {self.prior_name} returned NaN or infinite values in {bad} of "
+                    f"{v.numel()} voxels: use "
                     "other weights, or another prior"
                 )
 
@@ -231,19 +256,26 @@ class Mbir:
 
     @undisturbed
     @torch.no_grad()
-    def noise_map(self, problem: InsetProblem, b: Tensor, exposure_s: float, draws: int = 8, seed: int = 0) -> Tensor:
-        """Standard deviation of each voxel in HU, ``(z, y, x)``, of one statistic ``b`` ``(z, y, x)``.
+    def noise_map(
+        self, problem: InsetProblem, b: Tensor, exposure_s: float, draws: int = 8, seed: int = 0
+    ) -> Tensor:
+        """Standard deviation of each voxel in HU, ``(z, y, x)``, of one statistic ``b`` ``(z, y,
+        x)``.
 
-        The scan is perturbed by fresh noise of its own covariance; the network's response, root mean square over
-        ``draws`` and averaged over 3 × 3 × 3 voxels, estimates the noise that the volume holds already.
+        The scan is perturbed by fresh noise of its own covariance; the network's response, root
+        mean square over ``draws`` and averaged over 3 × 3 × 3 voxels, estimates the noise that the
+        volume holds already.
         """
         generator = torch.Generator().manual_seed(seed)
         noise = problem.gram.noise((draws,), generator=generator) * math.sqrt(exposure_s)
-        # Half of the noise in either direction: the response is the local one, and the reference is their mean.
+        # Half of the noise in either direction: the response is the local one, and the reference is
+        # their mean.
         both = torch.cat([b + noise / 2, b - noise / 2])
         volumes = self(problem, both, exposure_s)
         square = (volumes[:draws] - volumes[draws:]).square().mean(0)
-        return torch.nn.functional.avg_pool3d(square[None, None], 3, 1, 1, count_include_pad=False)[0, 0].sqrt()
+        return torch.nn.functional.avg_pool3d(square[None, None], 3, 1, 1, count_include_pad=False)[
+            0, 0
+        ].sqrt()
 
     def noisier_or_quieter(self, scales: Sequence[float]) -> list[float]:
         """Those of the noise scales in HU that the training has not seen."""
@@ -255,7 +287,9 @@ class Mbir:
         """Whether the prior has been trained on scans of some noise: a filter knows any."""
         return "prior" not in self.parts and float(self.model.seen_scale_hu[1]) > 0
 
-    def check(self, scales: Sequence[float], peak: float, unit: str = "HU", mu_water: float = 0.02) -> list[str]:
+    def check(
+        self, scales: Sequence[float], peak: float, unit: str = "HU", mu_water: float = 0.02
+    ) -> list[str]:
         """What speaks against trusting the network.
 
         Args:
@@ -269,14 +303,29 @@ class Mbir:
         if outside:
             seen = " and ".join(dict.fromkeys(in_words(s, unit, mu_water) for s in outside))
             found.append(
-                f"the noise scale of the scan, {seen}, lies outside of the {in_words(low, unit, mu_water).split()[0]}…"
-                f"{in_words(high, unit, mu_water)} of the training: the contrast of small structures may be wrong"
-                + (', and edges of bone less sharp than by "fbp" or "pwls"' if min(outside) < low else "")
+                f"the noise scale of the scan, {seen}, lies outside of the "
+                f"{in_words(low, unit, mu_water).split()[0]}…"
+                f"{in_words(high, unit, mu_water)} of the training: the contrast of small "
+                "structures may be wrong"
+                + (
+                    ', and edges of bone less sharp than by "fbp" or "pwls"'
+                    if min(outside) < low
+                    else ""
+                )
             )
         if peak > LARGEST_HU:
-            most, largest = (in_words(v, unit, mu_water, difference=False) for v in (peak, LARGEST_HU))
-            what = "metal shades the tissue beside it" if unit == "HU" else "what is so dense shades what is beside it"
-            more, learned = f"the volume reaches {most}, more than", ", and the prior has not learned that"
+            most, largest = (
+                in_words(v, unit, mu_water, difference=False) for v in (peak, LARGEST_HU)
+            )
+            what = (
+                "metal shades the tissue beside it"
+                if unit == "HU"
+                else "what is so dense shades what is beside it"
+            )
+            more, learned = (
+                f"the volume reaches {most}, more than",
+                ", and the prior has not learned that",
+            )
             found.append(
                 f"{more} the {largest} of the training: {what}{learned}"
                 if self.trained
@@ -295,17 +344,21 @@ def _fill(model: Unrolled, tensors: Mapping[str, Tensor]) -> None:
     """Put weights into a model (ValueError: they are of another one)."""
     state = model.state_dict()
     for name in [*state, *tensors]:
-        there, here = (tuple(part[name].shape) if name in part else "none" for part in (tensors, state))
+        there, here = (
+            tuple(part[name].shape) if name in part else "none" for part in (tensors, state)
+        )
         if there != here:
             raise ValueError(
-                f"they do not fit {name_of(model.network)}: {name} has the shape {there} in the file, {here} in the "
+                f"they do not fit {name_of(model.network)}: {name} has the shape {there} in the "
+                f"file, {here} in the "
                 "network"
             )
     model.load_state_dict(tensors)
 
 
 def working_grid(grid: VolumeGrid, voxel_mm: float) -> VolumeGrid:
-    """The grid of cubic voxels that covers ``grid``; ``grid`` itself if its voxels have that size already."""
+    """The grid of cubic voxels that covers ``grid``; ``grid`` itself if its voxels have that
+    size already."""
     if max(abs(s / voxel_mm - 1.0) for s in grid.spacing) <= 0.01:
         return grid
     shape = tuple(max(1, math.ceil(e / voxel_mm - 1e-6)) for e in grid.extent)
@@ -313,17 +366,23 @@ def working_grid(grid: VolumeGrid, voxel_mm: float) -> VolumeGrid:
 
 
 def average_onto(volume: Tensor, source: VolumeGrid, target: VolumeGrid) -> Tensor:
-    """Averages of a volume over the voxels of another grid that lies inside of it, ``(..., *target.shape)``."""
+    """Averages of a volume over the voxels of another grid that lies inside of it, ``(...,
+    *target.shape)``."""
     for axis in range(3):
         shared = overlap(source, target, axis)
         matrix = torch.from_numpy(shared / shared.sum(axis=1, keepdims=True))
-        volume = torch.movedim(torch.movedim(volume, axis - 3, -1) @ matrix.to(volume).T, -1, axis - 3)
+        volume = torch.movedim(
+            torch.movedim(volume, axis - 3, -1) @ matrix.to(volume).T, -1, axis - 3
+        )
     return volume
 
 
 def overlap(source: VolumeGrid, target: VolumeGrid, axis: int) -> np.ndarray[Any, Any]:
-    """How much of each target voxel lies in each source voxel along an axis, ``(target, source)``, as shares."""
+    """How much of each target voxel lies in each source voxel along an axis, ``(target,
+    source)``, as shares."""
     at, width = target.axes[axis][:, None], target.spacing[axis]
     middle, step = source.axes[axis], source.spacing[axis]
-    shared = np.minimum(at + width / 2, middle + step / 2) - np.maximum(at - width / 2, middle - step / 2)
+    shared = np.minimum(at + width / 2, middle + step / 2) - np.maximum(
+        at - width / 2, middle - step / 2
+    )
     return np.clip(shared, 0.0, None) / width

@@ -1,21 +1,23 @@
 """The learned prior: a small 3-D U-Net, blind to the unit of its input, that knows the noise level.
 
-It sees two volumes in noise units (:mod:`recon.mbir.problem`), the estimate so far and what a step towards the data
-would make of it, and gives a new estimate. (To give what must be added, the noise with the other sign, takes ten times
-as long to learn: the noise passes through every layer then.) Convolutions have no bias and every nonlinearity is a
-leaky ReLU, so the network is homogeneous: twice the input gives twice the output, and a volume of zeros stays zero
-(Mohan, Kadkhodaie, Simoncelli, Fernandez-Granda 2020, ICLR: bias-free networks generalise over noise levels). What it
-must know beside, the noise scale in HU (tissues have their HU), the fidelity and the step, changes gains of its
-channels only.
+It sees two volumes in noise units (:mod:`recon.mbir.problem`), the estimate so far and what a step
+towards the data would make of it, and gives a new estimate. (To give what must be added, the noise
+with the other sign, takes ten times as long to learn: the noise passes through every layer then.)
+Convolutions have no bias and every nonlinearity is a leaky ReLU, so the network is homogeneous:
+twice the input gives twice the output, and a volume of zeros stays zero (Mohan, Kadkhodaie,
+Simoncelli, Fernandez-Granda 2020, ICLR: bias-free networks generalise over noise levels). What it
+must know beside, the noise scale in HU (tissues have their HU), the fidelity and the step, changes
+gains of its channels only.
 
-A homogeneous network shrinks what it is unsure of towards 0, and 0 is the value of the surround unless ``local_mm`` is
-given: then the network works on differences from a Gaussian mean about each voxel, and a constant that is added to the
-volume passes through, so that all tissues are alike to it. With ``turns`` the result is the mean over quarter turns and
-mirror images about z, and a scene that is turned gives the turned volume.
+A homogeneous network shrinks what it is unsure of towards 0, and 0 is the value of the surround
+unless ``local_mm`` is given: then the network works on differences from a Gaussian mean about each
+voxel, and a constant that is added to the volume passes through, so that all tissues are alike to
+it. With ``turns`` the result is the mean over quarter turns and mirror images about z, and a scene
+that is turned gives the turned volume.
 
-Blocks of 2 × 2 × 2 voxels become channels first (Shi et al. 2016, CVPR, sub-voxel convolution), two more halvings
-follow (Ronneberger, Fischer, Brox 2015, U-Net): at 0.2 mm the coarsest cells have 1.6 mm, and the network sees 6 mm
-about each voxel, a whole plaque.
+Blocks of 2 × 2 × 2 voxels become channels first (Shi et al. 2016, CVPR, sub-voxel convolution), two
+more halvings follow (Ronneberger, Fischer, Brox 2015, U-Net): at 0.2 mm the coarsest cells have 1.6
+mm, and the network sees 6 mm about each voxel, a whole plaque.
 """
 
 from __future__ import annotations
@@ -32,7 +34,14 @@ from recon.mbir.bilateral import joint_bilateral
 from torchpcct.projector.operator import apply_linear
 from torchpcct.validate import number, whole
 
-__all__ = ["GUIDE_VOXELS", "REFERENCE_SCALE_HU", "Network", "NetworkConfig", "bilateral_prior", "edge_preserved"]
+__all__ = [
+    "GUIDE_VOXELS",
+    "REFERENCE_SCALE_HU",
+    "Network",
+    "NetworkConfig",
+    "bilateral_prior",
+    "edge_preserved",
+]
 
 CONDITIONS = 3
 """Numbers that steer the gains: logarithm of the noise scale, fidelity, step."""
@@ -40,9 +49,10 @@ REFERENCE_SCALE_HU = 200.0
 """Noise scale at which its conditioning variable is 0: about 1 s of the paper's scan."""
 GUIDE_VOXELS = 1.4
 """Width of the Gaussian that makes the bilateral filter's guide."""
-_FIRST, _SECOND = (2.8, 2.5, 1), (1.4, 4.0, 2)
-"""The filter is run twice, the second time guided by what the first has left: difference of the guide, in noise, that
-counts as an edge, reach and step in voxels."""
+_FIRST = (2.8, 2.5, 1)
+_SECOND = (1.4, 4.0, 2)
+"""The filter is run twice, the second time guided by what the first has left: difference of the
+guide, in noise, that counts as an edge, reach and step in voxels."""
 _SLOPE = 0.1
 _LEAST = 1e-3
 """In noise units: what the gate takes for 0."""
@@ -57,11 +67,14 @@ class NetworkConfig:
     Args:
         channels: of the three levels.
         voxel_mm: size of the cubic voxels that it is for.
-        local_mm: standard deviation of the Gaussian mean that it works relative to, mm; 0: relative to the surround.
-        bilateral: a third view of the data: the step towards them through a joint bilateral filter, twice
-            (:mod:`recon.mbir.bilateral`), to which the network adds what the filter has taken away.
-        gate: how much of the filtered view is in the result is decided voxel by voxel, else by one number. Where tissue
-            is wide and constant the filter is close to ideal, and nothing that is added to it would be better.
+        local_mm: standard deviation of the Gaussian mean that it works relative to, mm; 0: relative
+            to the surround.
+        bilateral: a third view of the data: the step towards them through a joint bilateral filter,
+            twice (:mod:`recon.mbir.bilateral`), to which the network adds what the filter has taken
+            away.
+        gate: how much of the filtered view is in the result is decided voxel by voxel, else by one
+            number. Where tissue is wide and constant the filter is close to ideal, and nothing that
+            is added to it would be better.
         turns: once trained, average over the eight turns and mirror images about z.
     """
 
@@ -133,7 +146,9 @@ class Network(nn.Module):
         views = [estimate, towards]
         if self.config.bilateral:
             if smoothed is None:
-                raise ValueError("a network with a bilateral filter needs the smoothed view of the data")
+                raise ValueError(
+                    "a network with a bilateral filter needs the smoothed view of the data"
+                )
             views.append(smoothed)
         if not self.config.local_mm:
             return self._symmetric(views, condition, mirrored)
@@ -159,7 +174,9 @@ class Network(nn.Module):
         extra = [(-n) % period for n in shape]
         pad = (0, extra[2], 0, extra[1], 0, extra[0])
         x = torch.cat([to_blocks(F.pad(v, pad)) for v in views], 1)
-        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.training and self.half_precision):
+        with torch.autocast(
+            x.device.type, torch.bfloat16, enabled=self.training and self.half_precision
+        ):
             fine = self.down[0](F.leaky_relu(self.enter(x), _SLOPE), condition)
             middle = self.down[1](self.narrow[0](F.avg_pool3d(fine, 2)), condition)
             coarse = self.down[2](self.narrow[1](F.avg_pool3d(middle, 2)), condition)
@@ -172,11 +189,14 @@ class Network(nn.Module):
         ]
         if not self.config.bilateral:
             return volumes[0]
-        return volumes[0] + (_part(volumes[1], volumes[2]) if self.config.gate else self.share) * views[2]
+        return (
+            volumes[0]
+            + (_part(volumes[1], volumes[2]) if self.config.gate else self.share) * views[2]
+        )
 
 
 def _part(one: Tensor, other: Tensor) -> Tensor:
-    """|one| of |one| + |other|, half of it where both are 0: a number that does not change with the unit."""
+    """|one| / (|one| + |other|), 1/2 where both are 0: it does not change with the unit."""
     a, b = one.abs() + _LEAST, other.abs() + _LEAST
     return a / (a + b)
 
@@ -186,31 +206,46 @@ def edge_preserved(towards: Tensor, guide_noise: Tensor) -> Tensor:
 
     Args:
         towards: ``(batch, z, y, x)`` in noise units.
-        guide_noise: ``(batch,)`` standard deviation of ``towards`` smoothed by :data:`GUIDE_VOXELS`.
+        guide_noise: ``(batch,)`` standard deviation of ``towards`` smoothed by
+            :data:`GUIDE_VOXELS`.
     """
-    once = joint_bilateral(towards, local_mean(towards, GUIDE_VOXELS), _FIRST[0] * guide_noise, *_FIRST[1:])
+    once = joint_bilateral(
+        towards, local_mean(towards, GUIDE_VOXELS), _FIRST[0] * guide_noise, *_FIRST[1:]
+    )
     return joint_bilateral(once, once, _SECOND[0] * guide_noise, *_SECOND[1:])
 
 
-def bilateral_prior(estimate: Tensor, towards: Tensor, condition: Tensor, smoothed: Tensor | None) -> Tensor:
-    """Called as a :class:`Network` with ``bilateral``, and nothing learned: :func:`edge_preserved` alone."""
+def bilateral_prior(
+    estimate: Tensor, towards: Tensor, condition: Tensor, smoothed: Tensor | None
+) -> Tensor:
+    """Called as a :class:`Network` with ``bilateral``, and nothing learned:
+    :func:`edge_preserved` alone."""
     if smoothed is None:
-        raise ValueError("these weights are of a network without the bilateral filter: take those that ship")
+        raise ValueError(
+            "these weights are of a network without the bilateral filter: take those that ship"
+        )
     return smoothed
 
 
 def local_mean(v: Tensor, sigma: float) -> Tensor:
-    """Gaussian mean about each voxel of ``v`` ``(..., z, y, x)``, ``sigma`` in voxels; only voxels of the volume count.
+    """Gaussian mean about each voxel of ``v`` ``(..., z, y, x)``, ``sigma`` in voxels; only voxels
+    of the volume count.
 
-    A product with a small dense matrix along each axis, whose rows add up to 1: faster than a convolution with so wide
-    a kernel on volumes of some 50 voxels, and a constant stays what it is up to the border.
+    A product with a small dense matrix along each axis, whose rows add up to 1: faster than a
+    convolution with so wide a kernel on volumes of some 50 voxels, and a constant stays what it is
+    up to the border.
     """
     for axis in (-3, -2, -1):
         at = torch.arange(v.shape[axis], dtype=v.dtype, device=v.device)
         weights = torch.exp(-0.5 * ((at[:, None] - at) / sigma).square())
         weights = weights / weights.sum(1, keepdim=True)
-        # A linear map with its transpose: autocast would have products, of gradients too, in 8 bits.
-        v = apply_linear(v, partial(_along, matrix=weights, axis=axis), partial(_along, matrix=weights.T, axis=axis))
+        # A linear map with its transpose: autocast would have products, of gradients too, in 8
+        # bits.
+        v = apply_linear(
+            v,
+            partial(_along, matrix=weights, axis=axis),
+            partial(_along, matrix=weights.T, axis=axis),
+        )
     return v
 
 
@@ -219,7 +254,9 @@ def _along(v: Tensor, matrix: Tensor, axis: int) -> Tensor:
     return torch.movedim(torch.movedim(v, axis, -1) @ matrix.T, -1, axis)
 
 
-def _turn(quarters: int, mirrored: bool) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
+def _turn(
+    quarters: int, mirrored: bool
+) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
     def there(v: Tensor) -> Tensor:
         return torch.rot90(v.flip(-1) if mirrored else v, quarters, (-2, -1))
 
@@ -231,7 +268,8 @@ def _turn(quarters: int, mirrored: bool) -> tuple[Callable[[Tensor], Tensor], Ca
 
 
 _TURNS = [_turn(quarters, mirrored) for mirrored in (False, True) for quarters in range(4)]
-"""The symmetries of a square about z, each with its inverse; those that exchange x and y are every second one."""
+"""The symmetries of a square about z, each with its inverse; those that exchange x and y are
+every second one."""
 
 
 class _Block(nn.Module):
@@ -268,11 +306,17 @@ def to_blocks(u: Tensor) -> Tensor:
     """``(batch, z, y, x)`` to ``(batch, 8, z/2, y/2, x/2)``."""
     b, z, y, x = u.shape
     return (
-        u.reshape(b, z // 2, 2, y // 2, 2, x // 2, 2).permute(0, 2, 4, 6, 1, 3, 5).reshape(b, 8, z // 2, y // 2, x // 2)
+        u.reshape(b, z // 2, 2, y // 2, 2, x // 2, 2)
+        .permute(0, 2, 4, 6, 1, 3, 5)
+        .reshape(b, 8, z // 2, y // 2, x // 2)
     ).contiguous(memory_format=torch.channels_last_3d)
 
 
 def from_blocks(blocks: Tensor) -> Tensor:
     """Inverse (and adjoint) of :func:`to_blocks`."""
     b, _, z, y, x = blocks.shape
-    return blocks.reshape(b, 2, 2, 2, z, y, x).permute(0, 4, 1, 5, 2, 6, 3).reshape(b, 2 * z, 2 * y, 2 * x)
+    return (
+        blocks.reshape(b, 2, 2, 2, z, y, x)
+        .permute(0, 4, 1, 5, 2, 6, 3)
+        .reshape(b, 2 * z, 2 * y, 2 * x)
+    )

@@ -1,21 +1,24 @@
-"""MBIR around the outlines of a vessel: what is sharp and smooth is drawn, the network reconstructs the rest.
+"""MBIR around the outlines of a vessel: what is sharp and smooth is drawn, the network reconstructs
+the rest.
 
-A network that sees some millimetres about a voxel has to find every piece of a vessel's outline by itself, in the noise
-of that place. A contrast-enhanced vessel has two smooth outlines over its whole length (lumen and outer wall, a dozen
-numbers a centimetre), so the data determine them far better (:mod:`recon.plaque.vessel`). With T the drawn vessel, in
-whose fibrous layer the best linear estimate of its contents stands (:mod:`recon.plaque.layer`),
+A network that sees some millimetres about a voxel has to find every piece of a vessel's outline by
+itself, in the noise of that place. A contrast-enhanced vessel has two smooth outlines over its
+whole length (lumen and outer wall, a dozen numbers a centimetre), so the data determine them far
+better (:mod:`recon.plaque.vessel`). With T the drawn vessel, in whose fibrous layer the best linear
+estimate of its contents stands (:mod:`recon.plaque.layer`),
 
     u = T + MBIR(β − H T),
 
-so whatever the drawing lacks (a branch, muscle, texture) comes from the data as ever, beside an edge that is no longer
-there to bleed into it.
+so whatever the drawing lacks (a branch, muscle, texture) comes from the data as ever, beside an
+edge that is no longer there to bleed into it.
 
-Where no vessel is found, or a drawn one does not explain the data within 1 mm of its wall, but for its fibrous layer,
-the result is the plain reconstruction MBIR(β).
+Where no vessel is found, or a drawn one does not explain the data within 1 mm of its wall, but for
+its fibrous layer, the result is the plain reconstruction MBIR(β).
 
-A drawing shows smooth outlines and nothing else. On disease that has others (a flap, an ulcer, a thrombus at the wall,
-inflamed fat, a stent) it may be wrong and explain the data all the same. So it is drawn only where somebody asks for
-it, the volume's warnings say so, and :meth:`OutlineMbir.plain` is there to be compared with.
+A drawing shows smooth outlines and nothing else. On disease that has others (a flap, an ulcer, a
+thrombus at the wall, inflamed fat, a stent) it may be wrong and explain the data all the same. So
+it is drawn only where somebody asks for it, the volume's warnings say so, and
+:meth:`OutlineMbir.plain` is there to be compared with.
 """
 
 from __future__ import annotations
@@ -47,15 +50,18 @@ from torchpcct.switches import undisturbed
 __all__ = ["Drawn", "OutlineMbir"]
 
 _SHIFT_HU = 200.0
-"""Where the zero lies does not matter to an image: 150 HU added to everything change it by 1 HU rms instead of 9."""
+"""Where the zero lies does not matter to an image: 150 HU added to everything change it by 1 HU
+rms instead of 9."""
 _APART_MM = 1.0
-"""From the wall: muscle, veins and other vessels further away speak against no drawing; what is nearer may be a part of
-the vessel that the drawing lacks."""
+"""From the wall: muscle, veins and other vessels further away speak against no drawing; what is
+nearer may be a part of the vessel that the drawing lacks."""
 _TISSUE_HU = 120.0, 350.0
-"""Wall and fibrous tissue above fat. Ten fits of sound vessels had 148 to 302 HU of fibrous tissue; inflamed fat about
-a healthy vessel was fitted with 29 to 75, a flap with 457 and 473, a stent with 28 and 33 HU."""
+"""Wall and fibrous tissue above fat. Ten fits of sound vessels had 148 to 302 HU of fibrous tissue;
+inflamed fat about a healthy vessel was fitted with 29 to 75, a flap with 457 and 473, a stent with
+28 and 33 HU."""
 _DRAWN = (
-    "a vessel with smooth outlines was drawn, and disease that has others (flap, ulcer, thrombus, inflamed fat, stent, "
+    "a vessel with smooth outlines was drawn, and disease that has others (flap, ulcer, thrombus, "
+    "inflamed fat, stent, "
     "calcifications below 1 mm) may be missing: compare with the reconstruction that draws nothing"
 )
 
@@ -67,8 +73,8 @@ class Drawn:
     Attributes:
         image: T, HU ``(z, y, x)``, or None.
         note: for the volume's report.
-        unexplained: the highest score (:func:`recon.plaque.quality.scores_of`) of what is left of the data, given the
-            reconstruction, HU ``(z, y, x)``.
+        unexplained: the highest score (:func:`recon.plaque.quality.scores_of`) of what is left of
+            the data, given the reconstruction, HU ``(z, y, x)``.
     """
 
     image: Tensor | None
@@ -77,19 +83,22 @@ class Drawn:
 
 
 def layer_sd_hu(fidelity: float) -> float:
-    """Prior standard deviation of what the fibrous layer holds, HU: from 50, quiet, to 200, for measuring contrast."""
+    """Prior standard deviation of what the fibrous layer holds, HU: from 50, quiet, to 200, for
+    measuring contrast."""
     return SD_HU * 4.0 ** (fidelity - DEFAULT_FIDELITY)
 
 
 class OutlineMbir(Mbir):
     """:class:`recon.mbir.mbir.Mbir` around the outlines of a vessel.
 
-    It is differentiable in the statistic; the fit by its linear model (of Gauss and Newton) at the mode.
+    It is differentiable in the statistic; the fit by its linear model (of Gauss and Newton) at the
+    mode.
 
     Args:
         network: gives weights, fidelity and parts.
-        vessel_prior: what is believed of the vessel before the data; None: a coronary artery, on a scanner whose zero
-            is not known (``shift`` of 200 HU), and one whose tissues are none of a coronary artery is not drawn.
+        vessel_prior: what is believed of the vessel before the data; None: a coronary artery, on a
+            scanner whose zero is not known (``shift`` of 200 HU), and one whose tissues are none of
+            a coronary artery is not drawn.
     """
 
     def __init__(self, network: Mbir, vessel_prior: VesselPrior | None = None) -> None:
@@ -103,24 +112,34 @@ class OutlineMbir(Mbir):
 
     @undisturbed
     def solved(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Reconstructed:
-        """See :meth:`recon.mbir.mbir.Mbir.solved`; the notes hold ``vessel``: whether it was drawn, or why not."""
+        """See :meth:`recon.mbir.mbir.Mbir.solved`; the notes hold ``vessel``: whether it was
+        drawn, or why not."""
         found = [self.drawn(problem, own, exposure_s) for own in b]
         notes = [one.note for one in found]
         normal = self.problem(problem, b, exposure_s)
         around = [k for k, one in enumerate(found) if one.image is not None]
         volumes: dict[int, Tensor] = {}
         if around:
-            part, images = normal.part(around), [one.image for one in found if one.image is not None]
+            part, images = (
+                normal.part(around),
+                [one.image for one in found if one.image is not None],
+            )
             t = self.in_noise_units(problem, torch.stack(images), part)
-            # Once the outlines are taken off, four turns do what eight do: 0.7 HU rms apart on the paper's plaque.
+            # Once the outlines are taken off, four turns do what eight do: 0.7 HU rms apart on the
+            # paper's plaque.
             network = self.model.network
-            quick = {"prior": partial(network, mirrored=False)} if isinstance(network, Network) else {}
+            quick = (
+                {"prior": partial(network, mirrored=False)} if isinstance(network, Network) else {}
+            )
             u = t + self.solution(replace(part, beta=part.beta - part.apply(t)), **quick)
-            for k, own, volume in zip(around, u, self.in_hu(problem, u.detach(), part), strict=True):
+            for k, own, volume in zip(
+                around, u, self.in_hu(problem, u.detach(), part), strict=True
+            ):
                 highest = found[k].unexplained(volume)
                 if highest > STRIKING:
                     notes[k] |= _not_drawn(
-                        f"its outlines leave {highest:.0f} standard deviations of the noise unexplained"
+                        f"its outlines leave {highest:.0f} standard deviations of the noise "
+                        "unexplained"
                     )
                 else:
                     volumes[k] = own
@@ -148,7 +167,9 @@ class OutlineMbir(Mbir):
             with threadpool_limits(limits=1, user_api="blas"):
                 prior = self.vessel_prior or VesselPrior(shift=_SHIFT_HU)
                 vessel = Vessel(data, find_vessel(data.pilot(), data.grid, None), prior)
-                estimate = LayerEstimate(vessel.fit(vessel.first_guess(), expected=True), layer_sd_hu(self.fidelity))
+                estimate = LayerEstimate(
+                    vessel.fit(vessel.first_guess(), expected=True), layer_sd_hu(self.fidelity)
+                )
         except (ValueError, np.linalg.LinAlgError) as error:
             return Drawn(None, _not_drawn(str(error)))
         fit = estimate.fit
@@ -159,7 +180,8 @@ class OutlineMbir(Mbir):
         outlines, others = (torch.from_numpy(v).to(b) for v in (fit.image, credited))
 
         def unexplained(volume: Tensor) -> float:
-            # The drawing knows fibrous tissue alone in the layer, and fat alone around: there the network is believed.
+            # The drawing knows fibrous tissue alone in the layer, and fat alone around: there the
+            # network is believed.
             there = data.apply(others * (volume - outlines))
             return float(np.abs(scores_of(vessel, fit, there)).max())
 
@@ -184,20 +206,26 @@ class _Linear(torch.autograd.Function):
 
 
 def _apart(vessel: Vessel, fit: Fit) -> NDArray[np.float32]:
-    """1 for voxels that are so far from the vessel's wall that nothing there can be meant for it, 0 elsewhere."""
+    """1 for voxels that are so far from the vessel's wall that nothing there can be meant for
+    it, 0 elsewhere."""
     outside = vessel.on_grid(fit.drawing.shares[0]) < 0.5
     distance = ndimage.distance_transform_edt(outside, sampling=vessel.grid.spacing)
     return (distance >= _APART_MM).astype(np.float32)
 
 
 def _strange_tissue(fit: Fit) -> str:
-    """Which fitted tissue is none, or nothing: inflamed fat, a flap and a stent are fitted with such values."""
+    """Which fitted tissue is none, or nothing: inflamed fat, a flap and a stent are fitted with
+    such values."""
     fat = fit.parameters[FAT]
     least, most = _TISSUE_HU
-    for name, value in (("wall", fit.parameters[WALL]), ("fibrous tissue", fit.parameters[FIBROUS])):
+    for name, value in (
+        ("wall", fit.parameters[WALL]),
+        ("fibrous tissue", fit.parameters[FIBROUS]),
+    ):
         if not least <= value - fat <= most:
             return (
-                f"its {name} would have {value - fat:.0f} HU more than what lies around the vessel, and a coronary "
+                f"its {name} would have {value - fat:.0f} HU more than what lies around the "
+                "vessel, and a coronary "
                 f"artery's has {least:.0f} to {most:.0f}"
             )
     return ""

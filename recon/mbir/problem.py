@@ -1,11 +1,14 @@
 """The normalised problem: what the network sees looks the same at every dose and voxel size.
 
-With the data's information I at 0.5 lp/mm (1/(HU² mm³), see :meth:`recon.gram.gram.Gram.information`) and the voxel
-volume V, the noise scale is c = (I V)^(−1/2) HU, and
+With the data's information I at 0.5 lp/mm (1/(HU² mm³), see
+:meth:`recon.gram.gram.Gram.information`) and the voxel volume V, the noise scale is c = (I
+V)^(−1/2) HU, and
 
-    u = x / c,      H = c² G  (about 1 at 0.5 lp/mm),      β = c b,      β = H u + noise of covariance H.
+    u = x / c,      H = c² G  (about 1 at 0.5 lp/mm),      β = c b,      β = H u + noise of
+    covariance H.
 
-So the same tissue at four times the dose looks to the network like twice the contrast at the same noise.
+So the same tissue at four times the dose looks to the network like twice the contrast at the same
+noise.
 """
 
 from __future__ import annotations
@@ -19,7 +22,13 @@ from torch import Tensor
 
 from recon.linear_operator import NormalOperator
 
-__all__ = ["NormalisedProblem", "filtered", "from_frequencies", "squared_frequencies", "to_frequencies"]
+__all__ = [
+    "NormalisedProblem",
+    "filtered",
+    "from_frequencies",
+    "squared_frequencies",
+    "to_frequencies",
+]
 
 
 @dataclass(frozen=True)
@@ -50,7 +59,8 @@ class NormalisedProblem:
 
         Args:
             gram: AᵀWA at unit exposure.
-            b: ``(batch, z, y, x)``, AᵀW y with the weights of the exposures, y in line integrals of mm⁻¹.
+            b: ``(batch, z, y, x)``, AᵀW y with the weights of the exposures, y in line integrals of
+                mm⁻¹.
             exposure: ``(batch,)`` factors on its weights.
             mu_per_hu: 1 HU in mm⁻¹.
             voxel_mm: size of the cubic voxels.
@@ -62,14 +72,17 @@ class NormalisedProblem:
     def with_beta(
         cls, gram: NormalOperator, beta: Tensor, exposure: Tensor, mu_per_hu: float, voxel_mm: float
     ) -> NormalisedProblem:
-        """From β, which is in noise units already; the other arguments are those of :meth:`from_statistic`."""
+        """From β, which is in noise units already; the other arguments are those of
+        :meth:`from_statistic`."""
         unit = gram.information(mu_per_hu)
         scale = (unit * exposure.to(beta) * voxel_mm**3).rsqrt()
         return cls(gram, beta, scale, exposure.to(beta) * (scale * mu_per_hu) ** 2, voxel_mm)
 
     def part(self, which: Sequence[int] | Tensor) -> NormalisedProblem:
         """Those of the batch."""
-        return replace(self, beta=self.beta[which], scale_hu=self.scale_hu[which], factor=self.factor[which])
+        return replace(
+            self, beta=self.beta[which], scale_hu=self.scale_hu[which], factor=self.factor[which]
+        )
 
     def apply(self, u: Tensor) -> Tensor:
         """H u."""
@@ -81,19 +94,26 @@ class NormalisedProblem:
         return self.gram.periodic_spectrum().to(self.beta) * self.factor.reshape(-1, 1, 1, 1)
 
 
-def squared_frequencies(shape: Sequence[int], voxel_mm: float, like: Tensor | None = None) -> Tensor:
-    """f² in (line pairs per mm)² on the frequencies of ``rfftn`` of volumes, ``(z, y, x//2 + 1)``; not to be changed.
+def squared_frequencies(
+    shape: Sequence[int], voxel_mm: float, like: Tensor | None = None
+) -> Tensor:
+    """f² in (line pairs per mm)² on the frequencies of ``rfftn`` of volumes, ``(z, y, x//2 + 1)``;
+    not to be changed.
 
     Args:
         shape: ``(z, y, x)`` of the volumes; voxel_mm: their voxels.
         like: whose dtype and device they get; None: float32 on the CPU.
     """
-    dtype, device = (torch.float32, torch.device("cpu")) if like is None else (like.dtype, like.device)
+    dtype, device = (
+        (torch.float32, torch.device("cpu")) if like is None else (like.dtype, like.device)
+    )
     return _squared_frequencies(tuple(shape), voxel_mm, dtype, device)
 
 
 @lru_cache(maxsize=32)
-def _squared_frequencies(shape: tuple[int, ...], voxel_mm: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+def _squared_frequencies(
+    shape: tuple[int, ...], voxel_mm: float, dtype: torch.dtype, device: torch.device
+) -> Tensor:
     z, y, x = shape
     # Not of inference mode: they are kept, and a training may come after.
     with torch.inference_mode(False):

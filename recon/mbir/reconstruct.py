@@ -25,7 +25,8 @@ __all__ = ["reconstruct_mbir"]
 
 
 FARTHEST_CELL = 4.0
-"""Detector cells at the axis may be so many times as large, or as small, as the network's voxels: clinical scanners."""
+"""Detector cells at the axis may be so many times as large, or as small, as the network's
+voxels: clinical scanners."""
 
 
 def reconstruct_mbir(
@@ -46,44 +47,54 @@ def reconstruct_mbir(
     look: float | None = None,
     outlines: bool | None = None,
 ) -> Iterator[list[Solution]]:
-    """Unrolled MBIR with the learned prior, of an inset or of a whole field (:mod:`recon.mbir.field`).
+    """Unrolled MBIR with the learned prior, of an inset or of a whole field
+    (:mod:`recon.mbir.field`).
 
     Args:
         scans: realisations of one scan.
         grid: the inset, or the field.
         progress: called with the finished fraction.
         network: with its weights; None: those of the package.
-        prior: in the place of the network, which keeps the data steps: a prior, a denoiser of HU, or a name such as
-            ``perona-malik`` or ``package.module:function`` (:func:`recon.mbir.priors.prior_of`).
+        prior: in the place of the network, which keeps the data steps: a prior, a denoiser of HU,
+            or a name such as ``perona-malik`` or ``package.module:function``
+            (:func:`recon.mbir.priors.prior_of`).
         problem: kept from an earlier call with the same scan and (working) grid; None: made here.
         batch: volumes at a time.
-        fidelity: from 0 (quiet images for viewing) to 1 (for measuring: more of the contrast and more noise), see
-            :mod:`recon.mbir.unrolled`; None: that of ``network``, which is 0.5 unless it was loaded with another.
+        fidelity: from 0 (quiet images for viewing) to 1 (for measuring: more of the contrast and
+            more noise), see :mod:`recon.mbir.unrolled`; None: that of ``network``, which is 0.5
+            unless it was loaded with another.
         noise_map: add an estimate of each voxel's standard deviation, ``report["noise_sd_hu"]``.
-        vessel: draw a contrast-enhanced vessel of the inset with smooth outlines, and let the network reconstruct what
-            they leave (:mod:`recon.mbir.outlines`); three times as long. Sharper on vessels that are so, wrong on
-            disease that has other outlines: ``warnings`` say whether it was drawn, and the report holds what it
-            changed. Where no vessel is found, or its outlines do not explain the data, the volume is the one without.
-        tissues: draw the tissues' values and a core as well (:mod:`recon.mbir.tissues`), at full contrast where the
-            data prove it; a few seconds a volume longer. Where they do not explain the data, the volume is the one
-            without, with a warning.
-        point: ``(z, y, x)`` mm where a reader sees the plaque, for ``tissues``; None: in the largest vessel.
-        vessel_prior: what is believed of the vessel's tissues before the data; None: a coronary artery.
+        vessel: draw a contrast-enhanced vessel of the inset with smooth outlines, and let the
+            network reconstruct what they leave (:mod:`recon.mbir.outlines`); three times as long.
+            Sharper on vessels that are so, wrong on disease that has other outlines: ``warnings``
+            say whether it was drawn, and the report holds what it changed. Where no vessel is
+            found, or its outlines do not explain the data, the volume is the one without.
+        tissues: draw the tissues' values and a core as well (:mod:`recon.mbir.tissues`), at full
+            contrast where the data prove it; a few seconds a volume longer. Where they do not
+            explain the data, the volume is the one without, with a warning.
+        point: ``(z, y, x)`` mm where a reader sees the plaque, for ``tissues``; None: in the
+            largest vessel.
+        vessel_prior: what is believed of the vessel's tissues before the data; None: a coronary
+            artery.
         look, outlines: the former names of ``fidelity`` and ``vessel``.
 
     Yields:
-        Volumes in HU, batch by batch. Report: ``iterations``, ``fidelity``, ``residual`` (what is left of the data at
-        the low frequencies that are the data's own, over what there was, :func:`recon.mbir.unrolled.low_residual`),
-        ``chi2`` (weighted squared residual per reading), ``weights_sha256`` or the name of the ``prior``, of noisy
-        scans ``residual_p`` (:mod:`torchpcct.metrics.residual_test`: does the volume explain its data?), ``warnings``;
-        with ``vessel`` or ``tissues``, under ``vessel``, whether one was drawn (``drawn``) or ``why`` not, and where it
-        was, ``drawn_minus_plain_hu``, the difference from the volume without drawing, like the volume in HU; with
-        ``tissues`` what was read of them, under that name.
+        Volumes in HU, batch by batch. Report: ``iterations``, ``fidelity``, ``residual`` (what is
+            left of the data at
+        the low frequencies that are the data's own, over what there was,
+        :func:`recon.mbir.unrolled.low_residual`), ``chi2`` (weighted squared residual per reading),
+        ``weights_sha256`` or the name of the ``prior``, of noisy scans ``residual_p``
+        (:mod:`torchpcct.metrics.residual_test`: does the volume explain its data?), ``warnings``;
+        with ``vessel`` or ``tissues``, under ``vessel``, whether one was drawn (``drawn``) or
+        ``why`` not, and where it was, ``drawn_minus_plain_hu``, the difference from the volume
+        without drawing, like the volume in HU; with ``tissues`` what was read of them, under that
+        name.
 
     Raises:
-        ValueError, TypeError: see :class:`recon.least_squares.inset_problem.InsetProblem`; an inset of a scanner whose
-            cells have another size than the network's voxels by far; a problem that was made for another grid; a
-            fidelity outside of 0 … 1; what is no prior, or returns NaN or another kind of volume; for a whole field see
+        ValueError, TypeError: see :class:`recon.least_squares.inset_problem.InsetProblem`; an inset
+            of a scanner whose cells have another size than the network's voxels by far; a problem
+            that was made for another grid; a fidelity outside of 0 … 1; what is no prior, or
+            returns NaN or another kind of volume; for a whole field see
             :func:`recon.mbir.field.field_solutions`.
         FileNotFoundError: the package has no weights.
     """
@@ -99,11 +110,15 @@ def reconstruct_mbir(
     if point is not None and not tissues:
         raise ValueError("point says where a plaque is: give it with tissues=True")
     if vessel_prior is not None and not (vessel or tissues):
-        raise ValueError("vessel_prior says what a vessel is made of: give it with vessel=True or tissues=True")
+        raise ValueError(
+            "vessel_prior says what a vessel is made of: give it with vessel=True or tissues=True"
+        )
     if problem is None and is_whole_field(scans[0], grid):
         for name, asked in (("noise_map", noise_map), ("vessel", vessel), ("tissues", tissues)):
             if asked:
-                raise ValueError(f"{name} needs the FFT model of a small inset: ask for a smaller grid")
+                raise ValueError(
+                    f"{name} needs the FFT model of a small inset: ask for a smaller grid"
+                )
         yield from field_solutions(scans, grid, network, progress)
         return
     if tissues:
@@ -114,7 +129,9 @@ def reconstruct_mbir(
     work = working_grid(grid, network.voxel_mm)
     problem = problem or InsetProblem(scans[0], work)
     if problem.grid != work:
-        raise ValueError(f"the problem was made for another grid: make it on {work} (recon.mbir.working_grid)")
+        raise ValueError(
+            f"the problem was made for another grid: make it on {work} (recon.mbir.working_grid)"
+        )
     for i in range(0, len(scans), batch):
         part = scans[i : i + batch]
         exposure = problem.exposure(part)
@@ -132,35 +149,53 @@ def reconstruct_mbir(
         found = []
         for k, (scan, volume, statistic) in enumerate(zip(part, hu, statistics, strict=True)):
             report: dict[str, Any] = {
-                "method": "mbir", "iterations": network.model.steps, "fidelity": network.fidelity,
-                "residual": residuals[k], "chi2": (statistic.energy + float(misfit[k])) / statistic.readings,
-                **network.made_with, **solution.notes[k],
-            }  # fmt: skip
-            seen = network.check([float(normal.scale_hu[k])], float(volume.max()), scan.unit, problem.mu_ref)
+                "method": "mbir",
+                "iterations": network.model.steps,
+                "fidelity": network.fidelity,
+                "residual": residuals[k],
+                "chi2": (statistic.energy + float(misfit[k])) / statistic.readings,
+                **network.made_with,
+                **solution.notes[k],
+            }
+            seen = network.check(
+                [float(normal.scale_hu[k])], float(volume.max()), scan.unit, problem.mu_ref
+            )
             warnings = [*report.pop("warnings", []), *seen]
             tests = []
             if not scan.noise_free:
-                tests = tested(RESIDUAL_TEST, warnings, problem.residual_test, scan, volume, data[k])
+                tests = tested(
+                    RESIDUAL_TEST, warnings, problem.residual_test, scan, volume, data[k]
+                )
             if isinstance(network, OutlineMbir) and report["vessel"]["drawn"]:
                 with torch.no_grad():
                     plain = network.plain(problem, statistic.b[None], exposure)
                     changed = volume - network.in_hu(problem, plain.u, plain.normal)[0]
-                report["drawn_minus_plain_hu"] = changed if work is grid else average_onto(changed, work, grid)
+                report["drawn_minus_plain_hu"] = (
+                    changed if work is grid else average_onto(changed, work, grid)
+                )
             if noise_map:
                 sd = network.noise_map(problem, statistic.b, exposure)
                 report["noise_sd_hu"] = sd if work is grid else average_onto(sd, work, grid)
             found.append(
-                Solution(volume if work is grid else average_onto(volume, work, grid), report, warnings, tests)
+                Solution(
+                    volume if work is grid else average_onto(volume, work, grid),
+                    report,
+                    warnings,
+                    tests,
+                )
             )
         yield found
         progress(min(i + batch, len(scans)) / len(scans))
 
 
 def _check_cells(scan: Scan, voxel_mm: float) -> None:
-    """Refuse a scanner, or a unit of length, on which the network's voxels mean nothing (ValueError)."""
+    """Refuse a scanner, or a unit of length, on which the network's voxels mean nothing
+    (ValueError)."""
     cell = length_unit(scan.geometry) * CELL_MM
     if not 1.0 / FARTHEST_CELL <= cell / voxel_mm <= FARTHEST_CELL:
         raise ValueError(
-            f"MBIR of an inset works on voxels of {voxel_mm:g} mm, what its network was trained for, and the detector "
-            f'cells of this scan have {cell:.3g} mm at the axis: use method="pwls", or check that lengths are in mm'
+            f"MBIR of an inset works on voxels of {voxel_mm:g} mm, what its network was trained "
+            "for, and the detector "
+            f'cells of this scan have {cell:.3g} mm at the axis: use method="pwls", or check that '
+            "lengths are in mm"
         )

@@ -1,17 +1,19 @@
 """What a reconstruction has left in the data although it is no noise.
 
-A prior takes away what looks like noise to it, and a pattern that it has not learned may look so: fine bars, a weave, a
-thread. But the noise of the data is known, so whether the difference between data and volume is noise can be asked. The
-step d = (H_c + δ)⁻¹ (β − H u) towards the data is cut into overlapping blocks under a sine window, and each block is
-transformed. A coefficient counts as structure if its size is more than :data:`_STRIKING` times what noise has there. So
-does a weaker one that goes on from it: in a block nearby at the same frequency (:data:`_CONTINUED`), or at the next
-frequency of the block (:data:`_BESIDE`; hysteresis, as for edges: Canny 1986, IEEE Trans. Pattern Anal. Mach. Intell.
-8:679). Their sum is what the volume lacks; all else stays noise (thresholds: Donoho, Johnstone 1994, Biometrika
-81:425). What is little beyond a threshold counts in part (:data:`_WHOLE`): so the volume is a continuous function of
-the data, and its gradient says what a small change of them does.
+A prior takes away what looks like noise to it, and a pattern that it has not learned may look so:
+fine bars, a weave, a thread. But the noise of the data is known, so whether the difference between
+data and volume is noise can be asked. The step d = (H_c + δ)⁻¹ (β − H u) towards the data is cut
+into overlapping blocks under a sine window, and each block is transformed. A coefficient counts as
+structure if its size is more than :data:`_STRIKING` times what noise has there. So does a weaker
+one that goes on from it: in a block nearby at the same frequency (:data:`_CONTINUED`), or at the
+next frequency of the block (:data:`_BESIDE`; hysteresis, as for edges: Canny 1986, IEEE Trans.
+Pattern Anal. Mach. Intell. 8:679). Their sum is what the volume lacks; all else stays noise
+(thresholds: Donoho, Johnstone 1994, Biometrika 81:425). What is little beyond a threshold counts in
+part (:data:`_WHOLE`): so the volume is a continuous function of the data, and its gradient says
+what a small change of them does.
 
-Noise alone passes the first threshold in one of six billion coefficients. A pattern that fills a block is found while
-it is far too weak to be seen in a voxel, and from there on followed.
+Noise alone passes the first threshold in one of six billion coefficients. A pattern that fills a
+block is found while it is far too weak to be seen in a voxel, and from there on followed.
 """
 
 from __future__ import annotations
@@ -27,13 +29,18 @@ from recon.mbir.problem import NormalisedProblem, filtered, from_frequencies
 
 __all__ = ["significant_residual"]
 
-_BLOCK, _STEP = 16, 4
-"""Edge of a block and distance of neighbours in voxels: at 0.2 mm 3.2 mm, some periods of the finest lines."""
-_STRIKING, _CONTINUED, _BESIDE = 4.75, 2.5, 1.5
-"""Thresholds, in root mean squares of a coefficient of noise. Line pairs of 1 mm at 0.35 s / 2 s keep 0.58 / 0.85 of
-their contrast (6 draws), 0.21 / 0.60 if nothing is put back, 0.52 by soft FBP; into 24 insets of noise nothing is put.
-Without following a pattern the first threshold must be lower for less: with 4.25 they keep 0.38 / 0.78, and 2 of the 24
-insets get stripes at 0.35 s. Followed from 4.25 those would have 110 HU. From 2.0 instead of 2.5: 0.61 / 0.86."""
+_BLOCK = 16
+_STEP = 4
+"""Edge of a block and distance of neighbours in voxels: at 0.2 mm 3.2 mm, some periods of the
+finest lines."""
+_STRIKING = 4.75
+_CONTINUED = 2.5
+_BESIDE = 1.5
+"""Thresholds, in root mean squares of a coefficient of noise. Line pairs of 1 mm at 0.35 s / 2 s
+keep 0.58 / 0.85 of their contrast (6 draws), 0.21 / 0.60 if nothing is put back, 0.52 by soft FBP;
+into 24 insets of noise nothing is put. Without following a pattern the first threshold must be
+lower for less: with 4.25 they keep 0.38 / 0.78, and 2 of the 24 insets get stripes at 0.35 s.
+Followed from 4.25 those would have 110 HU. From 2.0 instead of 2.5: 0.61 / 0.86."""
 _WHOLE = 1.1
 """What is so many times a threshold counts as a whole."""
 _REACH = 2
@@ -41,8 +48,11 @@ _REACH = 2
 _AXES = (-3, -2, -1)
 
 
-def significant_residual(problem: NormalisedProblem, spectrum: Tensor, u: Tensor, damping: float) -> Tensor:
-    """What ``u`` lacks, ``(batch, z, y, x)``: 0 where nothing but noise is left, and in slices smaller than a block.
+def significant_residual(
+    problem: NormalisedProblem, spectrum: Tensor, u: Tensor, damping: float
+) -> Tensor:
+    """What ``u`` lacks, ``(batch, z, y, x)``: 0 where nothing but noise is left, and in slices
+    smaller than a block.
 
     Args:
         problem: normalised problem.
@@ -65,7 +75,8 @@ def significant_residual(problem: NormalisedProblem, spectrum: Tensor, u: Tensor
 
 
 def _significant(step: Tensor, window: Tensor, noise: Tensor) -> Tensor:
-    """The structure in one volume ``(z, y, x)``, given the mean square of noise of a block's coefficients."""
+    """The structure in one volume ``(z, y, x)``, given the mean square of noise of a block's
+    coefficients."""
     edges = window.shape
     hops = [_STEP if e > 1 else 1 for e in edges]
     # Every voxel lies in as many blocks as the window's squares need to add up to a constant.
@@ -109,7 +120,12 @@ def _significant(step: Tensor, window: Tensor, noise: Tensor) -> Tensor:
             continue
         coefficients, power = _transformed(blocks(z, y)[own], window, noise)
         place = _flat((torch.searchsorted(own, which), *near[pair, 1:].T), power.shape)
-        beside = torch.zeros_like(power).flatten().scatter_reduce(0, place, of_near[pair], "amax").reshape(power.shape)
+        beside = (
+            torch.zeros_like(power)
+            .flatten()
+            .scatter_reduce(0, place, of_near[pair], "amax")
+            .reshape(power.shape)
+        )
         kept = coefficients * _structure(beside * _beyond(_CONTINUED, power), power)
         made = torch.fft.irfftn(kept, s=edges, dim=_AXES) * window
         for k, block in zip(own.tolist(), made, strict=True):
@@ -120,13 +136,15 @@ def _significant(step: Tensor, window: Tensor, noise: Tensor) -> Tensor:
 
 
 def _transformed(blocks: Tensor, window: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Coefficients of windowed blocks ``(count, z, y, x // 2 + 1)``, and their squares over those of noise."""
+    """Coefficients of windowed blocks ``(count, z, y, x // 2 + 1)``, and their squares over
+    those of noise."""
     coefficients = torch.fft.rfftn(blocks * window, dim=_AXES)
     return coefficients, torch.view_as_real(coefficients).square().sum(-1) / noise
 
 
 def _beyond(threshold: float, power: Tensor) -> Tensor:
-    """How much coefficients of such a power count: 0 up to a threshold, 1 from :data:`_WHOLE` times it on."""
+    """How much coefficients of such a power count: 0 up to a threshold, 1 from :data:`_WHOLE`
+    times it on."""
     share: Tensor = ((power / threshold**2 - 1.0) / (_WHOLE**2 - 1.0)).clamp(0.0, 1.0)
     return share
 
@@ -170,10 +188,12 @@ def _noise(correlation: Tensor, window: Tensor) -> Tensor:
     for axis, (e, lag) in enumerate(zip(edges, lags, strict=True)):
         # The product is even under inversion, so the transform is real; along one axis it is not.
         phase = torch.exp(-2j * math.pi / e * torch.outer(torch.arange(e), lag)).to(product.device)
-        product = torch.movedim(torch.tensordot(product.to(phase.dtype), phase, ([axis + 1], [1])), -1, axis + 1)
+        product = torch.movedim(
+            torch.tensordot(product.to(phase.dtype), phase, ([axis + 1], [1])), -1, axis + 1
+        )
     noise = product.real[..., : edges[2] // 2 + 1].clamp_min(torch.finfo(correlation.dtype).tiny)
-    # A coefficient that is its own mirror image is real, and reaches a threshold as often as a complex one reaches that
-    # over √2: it counts as half of its square.
+    # A coefficient that is its own mirror image is real, and reaches a threshold as often as a
+    # complex one reaches that over √2: it counts as half of its square.
     own = [2 * torch.arange(e) % e == 0 for e in edges]
     real = own[0][:, None, None] & own[1][:, None] & own[2][: edges[2] // 2 + 1]
     return torch.where(real.to(noise.device), 2.0 * noise, noise)

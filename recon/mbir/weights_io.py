@@ -1,7 +1,7 @@
 """Tensors in safetensors files that know their own checksum: shipped weights, training checkpoints.
 
-The header of a file names what it holds, JSON metadata, and the SHA-256 of tensors and metadata. Nothing in it is
-executed on loading, and a byte that has changed on the way is found.
+The header of a file names what it holds, JSON metadata, and the SHA-256 of tensors and metadata.
+Nothing in it is executed on loading, and a byte that has changed on the way is found.
 """
 
 from __future__ import annotations
@@ -32,11 +32,15 @@ def digest(tensors: Mapping[str, Tensor]) -> str:
     for name in sorted(tensors):
         tensor = tensors[name]
         total.update(f"{name} {tensor.dtype} {tuple(tensor.shape)};".encode())
-        total.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
+        total.update(
+            tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
+        )
     return total.hexdigest()
 
 
-def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
+def write_tensors(
+    path: Path, kind: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]
+) -> None:
     """Write a file, whole or not at all.
 
     Args:
@@ -50,9 +54,15 @@ def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], metadata
     # Copies, as safetensors refuses tensors that share memory.
     plain = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
     text = json.dumps(dict(metadata), ensure_ascii=False, allow_nan=False)
-    header = {"format": kind, "sha256": digest(plain), "metadata": text, "sha256_of_metadata": _sha256(text)}
+    header = {
+        "format": kind,
+        "sha256": digest(plain),
+        "metadata": text,
+        "sha256_of_metadata": _sha256(text),
+    }
     with atomic_write(path) as part:
-        part.write_bytes(save(plain, header))  # save_file writes a temporary file of its own, and leaves it if killed
+        # save_file writes a temporary file of its own, and leaves it if killed
+        part.write_bytes(save(plain, header))
 
 
 def read_tensors(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -69,7 +79,9 @@ def read_tensors(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, An
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
             if header.get("format") != kind:
-                raise TensorFileError(f"{path} is not a {kind!r} file (its format is {header.get('format')!r})")
+                raise TensorFileError(
+                    f"{path} is not a {kind!r} file (its format is {header.get('format')!r})"
+                )
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
         text = header["metadata"]
         metadata = json.loads(text)
@@ -80,10 +92,16 @@ def read_tensors(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, An
             f"{path} is damaged or not a safetensors file: {error}; take another copy of it"
         ) from error
     # Files of the first versions have a checksum of the tensors alone.
-    expected = {"sha256": digest(tensors), "sha256_of_metadata": header.get("sha256_of_metadata") and _sha256(text)}
-    if not set(header) <= _HEADER or any(header.get(name) != value for name, value in expected.items()):
+    expected = {
+        "sha256": digest(tensors),
+        "sha256_of_metadata": header.get("sha256_of_metadata") and _sha256(text),
+    }
+    if not set(header) <= _HEADER or any(
+        header.get(name) != value for name, value in expected.items()
+    ):
         raise TensorFileError(
-            f"{path} is damaged: its content does not have the checksum in its header; take another copy of it"
+            f"{path} is damaged: its content does not have the checksum in its header; take "
+            "another copy of it"
         )
     return tensors, metadata
 

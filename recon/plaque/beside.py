@@ -1,4 +1,5 @@
-"""What the noise of a scan does to FBP's means over a reading's regions: the other half of an honest comparison."""
+"""What the noise of a scan does to FBP's means over a reading's regions: the other half of an
+honest comparison."""
 
 from __future__ import annotations
 
@@ -17,14 +18,16 @@ __all__ = ["fbp_deviations"]
 
 
 def fbp_deviations(scan: Scan, grid: VolumeGrid, regions: Mapping[str, Any]) -> dict[str, float]:
-    """Standard deviation in HU of soft FBP's mean over each region, and of the contrast, of the noise alone.
+    """Standard deviation in HU of soft FBP's mean over each region, and of the contrast, of the
+    noise alone.
 
-    One adjoint pass a region (:mod:`recon.analytic.exact_noise`), with the variance of the readings that is expected
-    behind the known surround: what the inset adds to the attenuation, a few per cent of the counts, is left out, and so
-    is that the regions were found in the same noise.
+    One adjoint pass a region (:mod:`recon.analytic.exact_noise`), with the variance of the readings
+    that is expected behind the known surround: what the inset adds to the attenuation, a few per
+    cent of the counts, is left out, and so is that the regions were found in the same noise.
 
     Args:
-        scan: windowed, its surround known, noisy or noise free (then of the exposure its readings stand for).
+        scan: windowed, its surround known, noisy or noise free (then of the exposure its readings
+            stand for).
         grid: of the regions.
         regions: name → shares of the voxels, as :attr:`recon.plaque.reading.PlaqueReading.regions`.
 
@@ -32,7 +35,9 @@ def fbp_deviations(scan: Scan, grid: VolumeGrid, regions: Mapping[str, Any]) -> 
         ValueError: a scan of the whole detector, or of an unknown surround.
     """
     if scan.window is None or scan.surround is None:
-        raise ValueError("the noise of regions needs a scan whose surround is known: acquire it with region=")
+        raise ValueError(
+            "the noise of regions needs a scan whose surround is known: acquire it with region="
+        )
     masks = core_regions(regions)
     fbp = InsetFbp(scan, [grid], ["soft"])
     slope = scan.linearisation.slope(scan.air.log() - scan.surround.log())
@@ -47,5 +52,7 @@ def fbp_deviations(scan: Scan, grid: VolumeGrid, regions: Mapping[str, Any]) -> 
         covariance = adjoints.covariance_of(adjoints.window.take(variance))
         found |= {n: math.sqrt(covariance[k, k]) for k, n in enumerate(names)}
         if len(names) == 2:
-            found["contrast"] = math.sqrt(covariance[0, 0] + covariance[1, 1] - 2.0 * covariance[0, 1])
+            found["contrast"] = math.sqrt(
+                covariance[0, 0] + covariance[1, 1] - 2.0 * covariance[0, 1]
+            )
     return found

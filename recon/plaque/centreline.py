@@ -1,8 +1,10 @@
-"""The line a vessel runs along, in any direction: found in a smooth volume, and coordinates about it.
+"""The line a vessel runs along, in any direction: found in a smooth volume, and coordinates about
+it.
 
-A line is a cubic spline through points in mm with a frame that does not turn about it (rotation minimising: Wang,
-Jüttler, Zheng, Liu 2008, "Computation of rotation minimizing frames", the double reflection). A point of space has
-three coordinates there: s along the line, and distance ρ and angle θ in the plane across.
+A line is a cubic spline through points in mm with a frame that does not turn about it (rotation
+minimising: Wang, Jüttler, Zheng, Liu 2008, "Computation of rotation minimizing frames", the double
+reflection). A point of space has three coordinates there: s along the line, and distance ρ and
+angle θ in the plane across.
 """
 
 from __future__ import annotations
@@ -63,7 +65,9 @@ class Centreline:
     @cached_property
     def _at(self) -> Floats:
         """Position of every point along the line, 0 in the first."""
-        return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.points, axis=0), axis=1))])
+        return np.concatenate(
+            [[0.0], np.cumsum(np.linalg.norm(np.diff(self.points, axis=0), axis=1))]
+        )
 
     @cached_property
     def _spline(self) -> Any:
@@ -88,7 +92,8 @@ class Centreline:
 
     @cached_property
     def _samples(self) -> tuple[Floats, Floats, Floats]:
-        """Positions, points and a first normal of a fine polyline that reaches 20 mm beyond both ends."""
+        """Positions, points and a first normal of a fine polyline that reaches 20 mm beyond both
+        ends."""
         count = int(np.ceil((self.length + 40.0) / _FINE_MM)) + 1
         s = np.linspace(-20.0, self.length + 20.0, count)
         x, t = self.point(s), self.tangent(s)
@@ -107,9 +112,12 @@ class Centreline:
         return s, x, normal
 
     def across(self, s: Any) -> tuple[Floats, Floats]:
-        """Two unit vectors across the line at s, ``(..., 3)`` each; θ grows from the first to the second."""
+        """Two unit vectors across the line at s, ``(..., 3)`` each; θ grows from the first to
+        the second."""
         at, _, normals = self._samples
-        index = np.clip(np.rint((np.asarray(s) - at[0]) / (at[1] - at[0])).astype(int), 0, len(at) - 1)
+        index = np.clip(
+            np.rint((np.asarray(s) - at[0]) / (at[1] - at[0])).astype(int), 0, len(at) - 1
+        )
         t = self.tangent(s)
         first = normals[index]
         first = first - np.sum(first * t, -1, keepdims=True) * t
@@ -133,8 +141,11 @@ class Centreline:
         return Coordinates(s, np.maximum(rho, 1e-6), theta, np.stack([away, around, t], axis=1))
 
     def within(self, points: Floats, distance: float) -> NDArray[np.intp]:
-        """Which of the points ``(n, 3)`` lie nearer than ``distance`` mm, to some hundredths of a millimetre."""
-        return np.flatnonzero(np.isfinite(self._tree.query(points, distance_upper_bound=distance)[0]))
+        """Which of the points ``(n, 3)`` lie nearer than ``distance`` mm, to some hundredths of
+        a millimetre."""
+        return np.flatnonzero(
+            np.isfinite(self._tree.query(points, distance_upper_bound=distance)[0])
+        )
 
     @cached_property
     def _tree(self) -> Any:
@@ -144,17 +155,20 @@ class Centreline:
 def follow(
     volume: Floats, grid: VolumeGrid, threshold: float, start: Floats, reach: float
 ) -> tuple[Centreline, Floats]:
-    """Walk along a bright vessel from a point in it, both ways, to its ends or to the rim of the volume.
+    """Walk along a bright vessel from a point in it, both ways, to its ends or to the rim of the
+    volume.
 
     Args:
         volume: ``grid.shape`` HU, smooth.
         grid: of the volume.
         threshold: HU; the vessel is brighter.
         start: ``(3,)`` z, y, x mm.
-        reach: mm, radius of the ball whose bright voxels tell where the vessel is and where it goes.
+        reach: mm, radius of the ball whose bright voxels tell where the vessel is and where it
+            goes.
 
     Returns:
-        the line, and where on it the vessel ends, ``(2,)`` mm: beyond the rim of the volume where it goes on.
+        the line, and where on it the vessel ends, ``(2,)`` mm: beyond the rim of the volume where
+        it goes on.
 
     Raises:
         ValueError: nothing bright at the point, or a vessel too short to have a direction.
@@ -167,7 +181,11 @@ def follow(
     tree = cKDTree(points) if len(points) else None
 
     def ball(at: Floats) -> tuple[Floats, Floats, float]:
-        near = np.array(tree.query_ball_point(at, reach), dtype=int) if tree is not None else np.empty(0, int)
+        near = (
+            np.array(tree.query_ball_point(at, reach), dtype=int)
+            if tree is not None
+            else np.empty(0, int)
+        )
         if len(near) < 8:
             return at, np.zeros(3), 0.0
         w = weight[near]
@@ -180,7 +198,8 @@ def follow(
         middle, direction, mass = ball(middle)
     if not mass:
         raise ValueError(
-            f"no vessel brighter than {threshold:.0f} HU at {np.round(start, 2).tolist()} mm (z, y, x): "
+            f"no vessel brighter than {threshold:.0f} HU at {np.round(start, 2).tolist()} mm (z, "
+            "y, x): "
             "the reader needs a lumen with contrast agent; give a point in it or beside it"
         )
     halves: list[list[Floats]] = []
@@ -191,8 +210,8 @@ def follow(
         while len(walked) < _MOST_STEPS:
             moved, turned, full = ball(at + _STEP_MM * along)
             turned = turned if turned @ along >= 0 else -turned
-            # At an end the ball's mass stays behind: it no longer moves on. Noise holds it back too, where it is bright
-            # ahead.
+            # At an end the ball's mass stays behind: it no longer moves on. Noise holds it back
+            # too, where it is bright ahead.
             ahead = at + _AHEAD_MM * along
             there = ndimage.map_coordinates(excess, ((ahead - origin) / step).T, order=1)
             if (full < 0.25 * mass or (moved - at) @ along < 0.25 * _STEP_MM) and not there.all():
@@ -209,13 +228,17 @@ def follow(
     found = np.array([*halves[1][::-1], middle, *halves[0]])
     if len(found) < 6:
         raise ValueError(
-            f"the bright region at {np.round(start, 1).tolist()} mm (z, y, x) is no vessel that can be read: it has no "
-            "direction, or is shorter than 5 mm. Rings of metal (a stent), bone and noise are as bright; give a point "
+            f"the bright region at {np.round(start, 1).tolist()} mm (z, y, x) is no vessel that "
+            "can be read: it has no "
+            "direction, or is shorter than 5 mm. Rings of metal (a stent), bone and noise are as "
+            "bright; give a point "
             "in a lumen with contrast agent"
         )
     line = Centreline(smooth_line(found))
     profile = np.linspace(-2.0, line.length + 2.0, int((line.length + 4.0) / 0.05))
-    values = ndimage.map_coordinates(volume, ((line.point(profile) - origin) / step).T, order=1, mode="nearest")
+    values = ndimage.map_coordinates(
+        volume, ((line.point(profile) - origin) / step).T, order=1, mode="nearest"
+    )
     dark = values < threshold
     centre = np.searchsorted(profile, line.length / 2)
     before, after = np.flatnonzero(dark[:centre]), np.flatnonzero(dark[centre:])
@@ -236,7 +259,8 @@ def sections(
         low, high: part of the line, mm.
 
     Returns:
-        positions ``(n,)`` along the line, centres ``(n, 3)`` and radii ``(n,)`` of discs of the same area, mm.
+        positions ``(n,)`` along the line, centres ``(n, 3)`` and radii ``(n,)`` of discs of the
+        same area, mm.
     """
     points = np.array([a[0] for a in grid.axes]) + np.argwhere(mask) * np.array(grid.spacing)
     c = line.coordinates(points)
@@ -244,7 +268,8 @@ def sections(
     volume = float(np.prod(grid.spacing))
     keep, centres, radii = [], [], []
     for s in at:
-        # Half a step beyond the ends nothing is seen: sections there would be too small and off the line.
+        # Half a step beyond the ends nothing is seen: sections there would be too small and off the
+        # line.
         if s < low + _STEP_MM or s > high - _STEP_MM:
             continue
         inside = np.abs(c.s - s) < _STEP_MM
@@ -258,11 +283,14 @@ def sections(
 
 
 def smooth_line(points: Floats) -> Floats:
-    """Points of a walk ``(n, 3)``, filtered along it; a straight line stays what it is, also at its ends.
+    """Points of a walk ``(n, 3)``, filtered along it; a straight line stays what it is, also at its
+    ends.
 
     Whittaker's smoother: least squares with a penalty on second differences."""
     bend = np.diff(np.eye(len(points)), 2, axis=0)
-    return np.asarray(np.linalg.solve(np.eye(len(points)) + (_SMOOTH_MM / _STEP_MM) ** 4 * bend.T @ bend, points))
+    return np.asarray(
+        np.linalg.solve(np.eye(len(points)) + (_SMOOTH_MM / _STEP_MM) ** 4 * bend.T @ bend, points)
+    )
 
 
 def _unit(v: Floats) -> Floats:

@@ -1,8 +1,10 @@
-"""Plaque bodies: an ellipsoid inside the fibrous layer, which keeps a cap from the lumen. Shapes, prior, evidence.
+"""Plaque bodies: an ellipsoid inside the fibrous layer, which keeps a cap from the lumen. Shapes,
+prior, evidence.
 
-Eight numbers tell a shape: its centre (z, y, x mm), the logarithms of its semi-axes across the layer, around the lumen
-and along the vessel, a turn within the section, and the logarithm of the cap. Given the shape all else is linear or
-nearly so: its contrast δ to the fibrous tissue and the vessel's parameters are integrated out (Laplace).
+Eight numbers tell a shape: its centre (z, y, x mm), the logarithms of its semi-axes across the
+layer, around the lumen and along the vessel, a turn within the section, and the logarithm of the
+cap. Given the shape all else is linear or nearly so: its contrast δ to the fibrous tissue and the
+vessel's parameters are integrated out (Laplace).
 """
 
 from __future__ import annotations
@@ -25,7 +27,10 @@ __all__ = ["CorePrior", "CoreSpace", "Evidence"]
 
 Floats = NDArray[np.float64]
 
-CENTRE, AXES, TURN, CAP = slice(0, 3), slice(3, 6), 6, 7
+CENTRE = slice(0, 3)
+AXES = slice(3, 6)
+TURN = 6
+CAP = 7
 
 
 @dataclass(frozen=True)
@@ -57,9 +62,11 @@ class Evidence:
     """Of shapes, given the data.
 
     Attributes:
-        log: ``(m,)`` log marginal likelihood against no body, the vessel's parameters integrated out of both.
+        log: ``(m,)`` log marginal likelihood against no body, the vessel's parameters integrated
+            out of both.
         mean, variance: ``(m,)`` HU, HU² of δ given the shape.
-        shift: ``(m, p)`` per HU of δ, what the vessel's parameters lose to the body: mean − δ · shift.
+        shift: ``(m, p)`` per HU of δ, what the vessel's parameters lose to the body: mean − δ ·
+            shift.
         volume: ``(m,)`` mm³.
     """
 
@@ -74,26 +81,39 @@ class CoreSpace:
     """Where bodies can be in a fitted vessel, and what the data say of them.
 
     Args:
-        vessel, fit: the vessel, fitted with or without bodies. Bodies of the fit stay where they are.
+        vessel, fit: the vessel, fitted with or without bodies. Bodies of the fit stay where they
+            are.
         prior: of the body.
-        replaces: the body of the fit that is looked for again, so that its own trace counts as data; None: none.
-        against: log evidence of no body that :meth:`target` compares with (``none`` of another space); None: its own.
+        replaces: the body of the fit that is looked for again, so that its own trace counts as
+            data; None: none.
+        against: log evidence of no body that :meth:`target` compares with (``none`` of another
+            space); None: its own.
     """
 
     def __init__(
-        self, vessel: Vessel, fit: Fit, prior: CorePrior, replaces: int | None = None, against: float | None = None
+        self,
+        vessel: Vessel,
+        fit: Fit,
+        prior: CorePrior,
+        replaces: int | None = None,
+        against: float | None = None,
     ) -> None:
         self.vessel, self.fit, self.prior = vessel, fit, prior
         drawing = fit.drawing
         layer = drawing.shares[1] - drawing.shares[2]
         reach = 4.0 * float(vessel.sd.max())  # of soft edges, and of the voxels beside them
-        inside = (drawing.inner_distance < reach) & (drawing.lumen_distance > -reach) & (drawing.shares[0] > 0)
+        inside = (
+            (drawing.inner_distance < reach)
+            & (drawing.lumen_distance > -reach)
+            & (drawing.shares[0] > 0)
+        )
         if prior.point is not None:
             inside &= np.linalg.norm(vessel.points - np.array(prior.point), axis=1) < 3.0
         self.chosen = np.flatnonzero(inside)
         # Where a centre may lie: in the layer, with some of it on both sides.
         deep = (drawing.inner_distance < -0.1) & (drawing.lumen_distance > 0.1) & (layer > 0.3)
-        place = np.full(len(vessel.index) + 1, -1)  # the last one is that of neighbours which are no voxels
+        # the last one is that of neighbours which are no voxels
+        place = np.full(len(vessel.index) + 1, -1)
         place[self.chosen] = np.arange(len(self.chosen))
         self.neighbours = place[vessel.neighbours[self.chosen]]
         self.points = np.ascontiguousarray(vessel.points[self.chosen])
@@ -122,9 +142,9 @@ class CoreSpace:
         self.lower = np.linalg.cholesky(hessian)
         self.gradient = gradient
         self.pull = solve_triangular(self.lower, gradient, lower=True)
-        # Log evidence of no body, by the vessel as it stands here. The determinant is left out: the curvature of the
-        # outlines changes with the tissues' values, core or not, and its difference between two fits says nothing
-        # about the core, but is as large as what does.
+        # Log evidence of no body, by the vessel as it stands here. The determinant is left out: the
+        # curvature of the outlines changes with the tissues' values, core or not, and its
+        # difference between two fits says nothing about the core, but is as large as what does.
         self.none = -energy + 0.5 * float(self.pull @ self.pull)
         self.against = self.none if against is None else against
 
@@ -138,7 +158,7 @@ class CoreSpace:
         """``(chosen, p)``: G times the Jacobian of the vessel's parameters."""
         return np.ascontiguousarray(self.fit.curved[self.chosen][:, self.kept])
 
-    # -- shapes --------------------------------------------------------------------------------------------------
+    # -- shapes ------------------------------------------------------------------------------------
 
     def locate(self, centres: Floats) -> NDArray[np.int64]:
         """Index of the vessel's voxel at each centre ``(m, 3)``; −1 outside of it."""
@@ -178,7 +198,9 @@ class CoreSpace:
             )
         shapes = np.empty((count, 8))
         at = rng.choice(places, count, p=weight / weight.sum())
-        shapes[:, CENTRE] = self.vessel.points[at] + (rng.random((count, 3)) - 0.5) * self._step * 0.99
+        shapes[:, CENTRE] = (
+            self.vessel.points[at] + (rng.random((count, 3)) - 0.5) * self._step * 0.99
+        )
         shapes[:, AXES] = np.log(p.semi_axes) + p.axes_log_sd * rng.standard_normal((count, 3))
         shapes[:, TURN] = p.turn_sd * rng.standard_normal(count)
         shapes[:, CAP] = math.log(p.cap) + p.cap_log_sd * rng.standard_normal(count)
@@ -192,18 +214,30 @@ class CoreSpace:
         return np.stack([c * across + s * around, c * around - s * across, frame[:, 2]], axis=1)
 
     def shares(self, shapes: Floats) -> NDArray[np.float32]:
-        """Share of each of the chosen voxels in every body, ``(m, n)``; ``ValueError`` for shapes not ``(m, 8)``."""
+        """Share of each of the chosen voxels in every body, ``(m, n)``; ``ValueError`` for
+        shapes not ``(m, 8)``."""
         shaped("shapes", shapes, (None, 8))
         out = np.empty((len(shapes), len(self.chosen)), np.float32)
         run(
-            core_fractions, len(shapes), np.ascontiguousarray(shapes[:, CENTRE]),
-            np.ascontiguousarray(self.axes(shapes)), np.exp(shapes[:, AXES]), np.exp(shapes[:, CAP]), self.points,
-            self.vessel.sd, self.inner, self.lumen, self.lumen_sd, self.lumen_normal, self.blur, out,
+            core_fractions,
+            len(shapes),
+            np.ascontiguousarray(shapes[:, CENTRE]),
+            np.ascontiguousarray(self.axes(shapes)),
+            np.exp(shapes[:, AXES]),
+            np.exp(shapes[:, CAP]),
+            self.points,
+            self.vessel.sd,
+            self.inner,
+            self.lumen,
+            self.lumen_sd,
+            self.lumen_normal,
+            self.blur,
+            out,
             operations=50 * len(self.points),
-        )  # fmt: skip
+        )
         return out
 
-    # -- data ----------------------------------------------------------------------------------------------------
+    # -- data --------------------------------------------------------------------------------------
 
     def evidence(self, shares: NDArray[np.float32]) -> Evidence:
         """Of bodies ``(m, n)``."""
@@ -224,12 +258,15 @@ class CoreSpace:
         return Evidence(log, mean, 1.0 / precision, shift, volume)
 
     def target(self, shapes: Floats) -> tuple[Floats, Floats]:
-        """Log prior and log evidence of shapes ``(m, 8)``, as :func:`recon.plaque.particles.lead` takes them."""
+        """Log prior and log evidence of shapes ``(m, 8)``, as
+        :func:`recon.plaque.particles.lead` takes them."""
         prior = self.log_prior(shapes)
         log = np.zeros(len(shapes))
         allowed = np.isfinite(prior)
         if allowed.any():
-            log[allowed] = self.evidence(self.shares(shapes[allowed])).log + (self.none - self.against)
+            log[allowed] = self.evidence(self.shares(shapes[allowed])).log + (
+                self.none - self.against
+            )
         return prior, log
 
     def nothing(self, shapes: Floats) -> tuple[Floats, Floats]:

@@ -34,8 +34,8 @@ class TissueData:
 
     Args:
         b: ``grid.shape``, HU⁻¹.
-        gram: G up to ``scale``, with ``apply``, ``lag_kernels``, ``polynomials``, ``periodic_spectrum`` and ``grid``
-            (:class:`recon.gram.gram.Gram`).
+        gram: G up to ``scale``, with ``apply``, ``lag_kernels``, ``polynomials``,
+            ``periodic_spectrum`` and ``grid`` (:class:`recon.gram.gram.Gram`).
         scale: G in HU⁻² is ``scale`` times ``gram``.
     """
 
@@ -46,7 +46,8 @@ class TissueData:
     def __post_init__(self) -> None:
         if self.gram.grid.ndim != 3 or tuple(self.b.shape) != tuple(self.gram.grid.shape):
             raise ValueError(
-                f"the statistic has shape {tuple(self.b.shape)}, its operator {self.gram.grid.shape}: "
+                f"the statistic has shape {tuple(self.b.shape)}, its operator "
+                f"{self.gram.grid.shape}: "
                 "both must be of one (z, y, x) grid"
             )
         if not bool(torch.isfinite(self.b).all()):
@@ -66,7 +67,9 @@ class TissueData:
         Raises:
             ValueError: see :class:`recon.least_squares.inset_problem.InsetProblem`.
         """
-        return cls.of_statistic(problem.statistic(scan).b, problem, scan.exposure_s or NOISE_FREE_EXPOSURE_S)
+        return cls.of_statistic(
+            problem.statistic(scan).b, problem, scan.exposure_s or NOISE_FREE_EXPOSURE_S
+        )
 
     @classmethod
     def of_statistic(cls, b: Tensor, problem: Any, exposure_s: float) -> TissueData:
@@ -88,7 +91,8 @@ class TissueData:
         return out
 
     def pilot(self, b: Tensor | None = None) -> Floats:
-        """A smooth linear estimate, ``grid.shape`` HU: some steps towards least squares, then a Gaussian filter.
+        """A smooth linear estimate, ``grid.shape`` HU: some steps towards least squares, then a
+        Gaussian filter.
 
         Args:
             b: of another statistic, ``grid.shape`` HU⁻¹; None: of the data.
@@ -97,7 +101,9 @@ class TissueData:
         sd = [_PILOT_SD_MM / step for step in self.grid.spacing]
         return np.asarray(ndimage.gaussian_filter(x.double().numpy(), sd, mode="nearest"))
 
-    def least_squares(self, b: Tensor, steps: int, free: Tensor | float = 1.0, precision: float = 0.0) -> Tensor:
+    def least_squares(
+        self, b: Tensor, steps: int, free: Tensor | float = 1.0, precision: float = 0.0
+    ) -> Tensor:
         """Some conjugate gradients towards least squares, ``grid.shape`` HU.
 
         Args:
@@ -110,18 +116,24 @@ class TissueData:
         floor = _FLOOR * float(spectrum.max())
 
         def precondition(v: Tensor) -> Tensor:
-            return free * torch.fft.irfftn(torch.fft.rfftn(free * v, dim=(1, 2, 3)) / (spectrum + floor), s=v.shape[1:])
+            return free * torch.fft.irfftn(
+                torch.fft.rfftn(free * v, dim=(1, 2, 3)) / (spectrum + floor), s=v.shape[1:]
+            )
 
         def curved(v: Tensor) -> Tensor:
             return free * self.apply(free * v) + v * precision
 
-        return free * conjugate_gradient(curved, (free * b)[None], precondition, iterations=steps)[0]
+        return (
+            free * conjugate_gradient(curved, (free * b)[None], precondition, iterations=steps)[0]
+        )
 
     def scores(self, left: Tensor, sd_mm: tuple[float, float]) -> Floats:
-        """How far each place of a residual stands out of the noise, ``grid.shape`` standard deviations.
+        """How far each place of a residual stands out of the noise, ``grid.shape`` standard
+        deviations.
 
-        The residual b − Gx has the covariance G. What a small body leaves in it is sought as a difference of two
-        Gaussians, which knows nothing of slow errors of the background; at the rim of the grid the noise is up to 1.2.
+        The residual b − Gx has the covariance G. What a small body leaves in it is sought as a
+        difference of two Gaussians, which knows nothing of slow errors of the background; at the
+        rim of the grid the noise is up to 1.2.
 
         Args:
             left: ``grid.shape`` HU⁻¹.
@@ -129,14 +141,23 @@ class TissueData:
         """
         n, steps = self.grid.shape, self.grid.spacing
         last = np.fft.rfftfreq(n[2], steps[2])
-        f2 = np.fft.fftfreq(n[0], steps[0])[:, None, None] ** 2 + np.fft.fftfreq(n[1], steps[1])[:, None] ** 2 + last**2
-        passed = np.exp(-2.0 * (math.pi * sd_mm[0]) ** 2 * f2) - np.exp(-2.0 * (math.pi * sd_mm[1]) ** 2 * f2)
+        f2 = (
+            np.fft.fftfreq(n[0], steps[0])[:, None, None] ** 2
+            + np.fft.fftfreq(n[1], steps[1])[:, None] ** 2
+            + last**2
+        )
+        passed = np.exp(-2.0 * (math.pi * sd_mm[0]) ** 2 * f2) - np.exp(
+            -2.0 * (math.pi * sd_mm[1]) ** 2 * f2
+        )
         spectrum = np.asarray(self.gram.periodic_spectrum().double()) * self.scale
-        # Frequencies of a real volume come in pairs, but for the first and, of an even number, the last.
+        # Frequencies of a real volume come in pairs, but for the first and, of an even number, the
+        # last.
         pairs = np.where((last > 0) & (last < 0.5 / steps[2] - 1e-9), 2.0, 1.0)
         noise = math.sqrt(float((pairs * passed**2 * spectrum).sum()) / math.prod(n))
         narrow, wide = (
-            ndimage.gaussian_filter(left.double().numpy(), [sd / step for step in steps], mode="nearest")
+            ndimage.gaussian_filter(
+                left.double().numpy(), [sd / step for step in steps], mode="nearest"
+            )
             for sd in sd_mm
         )
         return np.asarray((narrow - wide) / noise)

@@ -1,4 +1,5 @@
-"""Draws of every figure from the posterior: over the shapes of the core, its contrast, and the vessel's parameters."""
+"""Draws of every figure from the posterior: over the shapes of the core, its contrast, and the
+vessel's parameters."""
 
 from __future__ import annotations
 
@@ -45,9 +46,14 @@ def estimate(draws: Floats, unit: str) -> Estimate:
 
 
 def draws_of(
-    vessel: Vessel, fit: Fit, space: CoreSpace, shapes: Floats, shares: NDArray[np.float32], texture: Texture,
+    vessel: Vessel,
+    fit: Fit,
+    space: CoreSpace,
+    shapes: Floats,
+    shares: NDArray[np.float32],
+    texture: Texture,
     rng: np.random.Generator,
-) -> dict[str, Floats]:  # fmt: skip
+) -> dict[str, Floats]:
     """Draws ``(shapes · 20,)`` of each figure, those of the core given that it is there.
 
     Args:
@@ -63,7 +69,8 @@ def draws_of(
     base = fit.parameters[space.kept] + inverse @ space.gradient
 
     def linear(value: Floats, gradient: Floats) -> Floats:
-        """Draws of figures that change by ``gradient`` ``(m or 1, p)`` with the parameters, ``value`` at the fit's."""
+        """Draws of figures that change by ``gradient`` ``(m or 1, p)`` with the parameters,
+        ``value`` at the fit's."""
         gradient = np.atleast_2d(gradient)
         sd = np.sqrt(np.einsum("mp,pq,mq->m", gradient, inverse, gradient))
         mean = value + gradient @ (base - fit.parameters[space.kept])
@@ -79,10 +86,14 @@ def draws_of(
     }
     noise = {name: rng.standard_normal((m, _EACH)) for name in ("contrast", "fibrous")}
     # The texture's own mean over a tissue is not the tissue's value.
-    values["core"] = values["fibrous"] + delta + texture.sd_of("core") * rng.standard_normal((m, _EACH))
+    values["core"] = (
+        values["fibrous"] + delta + texture.sd_of("core") * rng.standard_normal((m, _EACH))
+    )
     values["fibrous"] = values["fibrous"] + texture.sd_of("fibrous") * noise["fibrous"]
     values["contrast"] = -delta + texture.sd_of("contrast") * noise["contrast"]
-    values["wall thickness"] = np.exp(linear(np.array([fit.parameters[THICKNESS]]), unit[THICKNESS]))
+    values["wall thickness"] = np.exp(
+        linear(np.array([fit.parameters[THICKNESS]]), unit[THICKNESS])
+    )
     centre = shapes[:, CENTRE].mean(0)
     s = float(vessel.start.lumen.coordinates(centre[None]).s[0])
     value, gradient = _area(vessel, fit, np.array([s]), count)
@@ -112,11 +123,16 @@ def _area(vessel: Vessel, fit: Fit, s: Floats, count: int) -> tuple[Floats, Floa
     return 0.5 * (r**2).reshape(len(s), 48).sum(1) * (2 * math.pi / 48), gradient
 
 
-def _caps(vessel: Vessel, fit: Fit, space: CoreSpace, shapes: Floats, count: int) -> tuple[Floats, Floats]:
-    """Smallest distance of each core from the lumen, mm ``(m,)``, and its gradient ``(m, count)``."""
+def _caps(
+    vessel: Vessel, fit: Fit, space: CoreSpace, shapes: Floats, count: int
+) -> tuple[Floats, Floats]:
+    """Smallest distance of each core from the lumen, mm ``(m,)``, and its gradient ``(m,
+    count)``."""
     k = np.arange(_SURFACE) + 0.5
     polar, around = np.arccos(1 - 2 * k / _SURFACE), math.pi * (1 + math.sqrt(5)) * k
-    sphere = np.stack([np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)], 1)
+    sphere = np.stack(
+        [np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)], 1
+    )
     m = len(shapes)
     local = sphere[None] * np.exp(shapes[:, None, AXES])
     points = shapes[:, None, CENTRE] + np.einsum("mka,maz->mkz", local, space.axes(shapes))

@@ -1,4 +1,5 @@
-"""CPU kernels: bodies drawn on voxels, an averaging undone, and the Gram operator between chosen voxels."""
+"""CPU kernels: bodies drawn on voxels, an averaging undone, and the Gram operator between chosen
+voxels."""
 
 from __future__ import annotations
 
@@ -7,15 +8,23 @@ import math
 import numpy as np
 from numba import njit
 
-__all__ = ["core_fractions", "gather_block", "outline_radius", "outline_spread", "sharpened", "symmetric_step"]
+__all__ = [
+    "core_fractions",
+    "gather_block",
+    "outline_radius",
+    "outline_spread",
+    "sharpened",
+    "symmetric_step",
+]
 
 
 @njit(cache=True)
 def sharpened(values, neighbours, excess, out):
-    """Take an averaging of variance ``excess`` (along each axis, in squared voxels) off values on voxels.
+    """Take an averaging of variance ``excess`` (along each axis, in squared voxels) off values on
+    voxels.
 
-    ``out = values − ½ excess Σ (second difference along each axis)``: the inverse of the averaging to second order in
-    the frequency, and no steeper where the voxels hold nothing any more.
+    ``out = values − ½ excess Σ (second difference along each axis)``: the inverse of the averaging
+    to second order in the frequency, and no steeper where the voxels hold nothing any more.
 
     Args:
         values: ``(n, k)``.
@@ -35,16 +44,35 @@ def sharpened(values, neighbours, excess, out):
 
 
 @njit(nogil=True, cache=True)
-def core_fractions(begin, end, centres, axes, semi, caps, points, sd, inner, lumen, lumen_sd, lumen_normal, blur, out):
-    """Each ellipsoid inside the fibrous layer and farther than a cap from the lumen, drawn with soft edges.
+def core_fractions(
+    begin,
+    end,
+    centres,
+    axes,
+    semi,
+    caps,
+    points,
+    sd,
+    inner,
+    lumen,
+    lumen_sd,
+    lumen_normal,
+    blur,
+    out,
+):
+    """Each ellipsoid inside the fibrous layer and farther than a cap from the lumen, drawn with
+    soft edges.
 
-    Where a body meets the cap the part inside of both is that of two Gaussians whose correlation is the cosine of the
-    angle between the outlines, exact where both halve the voxel; the wall's inner surface is taken for parallel.
+    Where a body meets the cap the part inside of both is that of two Gaussians whose correlation is
+    the cosine of the angle between the outlines, exact where both halve the voxel; the wall's inner
+    surface is taken for parallel.
 
     Args:
-        centres: ``(bodies, 3)`` mm; axes: ``(bodies, 3, 3)`` rows are the unit axes; semi: ``(bodies, 3)`` mm.
+        centres: ``(bodies, 3)`` mm; axes: ``(bodies, 3, 3)`` rows are the unit axes; semi:
+            ``(bodies, 3)`` mm.
         caps: ``(bodies,)`` mm.
-        points: ``(n, 3)`` voxel centres, ordered by z; sd: ``(3,)`` of the edges along each axis, mm.
+        points: ``(n, 3)`` voxel centres, ordered by z; sd: ``(3,)`` of the edges along each axis,
+            mm.
         inner: ``(n,)`` share of each voxel inside the wall's inner surface.
         lumen: ``(n,)`` distance from the lumen, mm; lumen_sd: ``(n,)`` of its edge, mm;
             lumen_normal: ``(n, 3)``.
@@ -58,7 +86,10 @@ def core_fractions(begin, end, centres, axes, semi, caps, points, sd, inner, lum
         for k in range(3):
             flattest += 1.0 / semi[p, k] ** 2
         out[p] = 0.0
-        first, last = np.searchsorted(points[:, 0], cz - largest), np.searchsorted(points[:, 0], cz + largest)
+        first, last = (
+            np.searchsorted(points[:, 0], cz - largest),
+            np.searchsorted(points[:, 0], cz + largest),
+        )
         for i in range(first, last):
             z, y, x = points[i, 0] - cz, points[i, 1] - cy, points[i, 2] - cx
             if z * z + y * y + x * x > largest * largest or inner[i] <= 0.0:
@@ -80,12 +111,15 @@ def core_fractions(begin, end, centres, axes, semi, caps, points, sd, inner, lum
                 nz, ny, nx = gz / g, gy / g, gx / g
                 variance = (sd[0] * nz) ** 2 + (sd[1] * ny) ** 2 + (sd[2] * nx) ** 2
                 variance = variance + blur * (1.0 - nz * nz)
-                # The distance's own average under the blur: half the sum of the curvatures times its variance.
+                # The distance's own average under the blur: half the sum of the curvatures times
+                # its variance.
                 d = (r - 1.0) * r / g + 0.5 * (flattest - q / f) * r / g * variance
             share = 0.5 * math.erfc(d / math.sqrt(2.0 * variance))
             if share > 1e-4:
                 far = 0.5 * math.erfc((caps[p] - lumen[i]) / (math.sqrt(2.0) * lumen_sd[i]))
-                along = -(nz * lumen_normal[i, 0] + ny * lumen_normal[i, 1] + nx * lumen_normal[i, 2])
+                along = -(
+                    nz * lumen_normal[i, 0] + ny * lumen_normal[i, 1] + nx * lumen_normal[i, 2]
+                )
                 weight = math.asin(min(abs(along), 1.0)) * 2.0 / math.pi
                 both = min(share, far) if along > 0.0 else max(share + far - 1.0, 0.0)
                 out[p, i] = min(weight * both + (1.0 - weight) * share * far, inner[i])
@@ -96,10 +130,12 @@ def gather_block(begin, end, kernel, polynomials, there, runs, out):
     """The Gram operator from voxels of one slice to voxels of another.
 
     Args:
-        kernel: ``(terms, 2·ny − 1, 2·nx − 1)`` of the two slices, lag 0 in the middle, its x axis mirrored.
+        kernel: ``(terms, 2·ny − 1, 2·nx − 1)`` of the two slices, lag 0 in the middle, its x axis
+            mirrored.
         polynomials: ``(terms, ny, nx)``.
         there: ``(n, 2)`` indices (y, x) in the slice that is written.
-        runs: ``(runs, 4)`` of voxels in the slice that is read, side by side along x: y, first x, first column, count.
+        runs: ``(runs, 4)`` of voxels in the slice that is read, side by side along x: y, first x,
+            first column, count.
         out: ``(n, m)``, filled.
     """
     terms = kernel.shape[0]
@@ -145,7 +181,8 @@ def outline_radius(first, spline, spline_slope, wave, wave_slope, shape, r, turn
 
 @njit(cache=True)
 def outline_spread(change, first, spline, wave, out):
-    """Add change · dr/d(coefficients) to ``out`` ``(n, splines · orders)``; arguments as in :func:`outline_radius`."""
+    """Add change · dr/d(coefficients) to ``out`` ``(n, splines · orders)``; arguments as in
+    :func:`outline_radius`."""
     orders = wave.shape[1]
     for i in range(first.size):
         if change[i] != 0.0:
@@ -157,7 +194,8 @@ def outline_spread(change, first, spline, wave, out):
 
 @njit(cache=True, fastmath={"contract", "reassoc", "nsz"})
 def symmetric_step(block, here, there, out_here, out_there):
-    """Add ``block @ here`` to ``out_there`` and its transpose times ``there`` to ``out_here``, reading it once.
+    """Add ``block @ here`` to ``out_there`` and its transpose times ``there`` to ``out_here``,
+    reading it once.
 
     Args:
         block: ``(n, m)``; here, out_here: ``(m,)``; there, out_there: ``(n,)``.

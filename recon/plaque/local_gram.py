@@ -1,7 +1,8 @@
-"""AᵀWA between the voxels of a vessel, as dense blocks of two slices: a product with many columns is a few GEMMs.
+"""AᵀWA between the voxels of a vessel, as dense blocks of two slices: a product with many columns
+is a few GEMMs.
 
-A vessel fills a few per cent of the inset. What a model of it changes is 0 elsewhere, so the blocks replace the
-transforms of the whole inset, hundreds of them in one fit.
+A vessel fills a few per cent of the inset. What a model of it changes is 0 elsewhere, so the blocks
+replace the transforms of the whole inset, hundreds of them in one fit.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ class LocalGram:
     """G restricted to a set of voxels.
 
     Args:
-        blocks: (first slice, lag) → ``(n, m)`` from voxels of the slice to those of slice + lag, in their order.
+        blocks: (first slice, lag) → ``(n, m)`` from voxels of the slice to those of slice + lag, in
+            their order.
         slices: start of every slice in the set, ``(nz + 1,)``.
     """
 
@@ -37,7 +39,8 @@ class LocalGram:
 
     @classmethod
     def of(cls, gram: Any, index: NDArray[np.int64], scale: float) -> LocalGram:
-        """From an operator with ``lag_kernels()`` and ``polynomials`` (:class:`recon.gram.gram.Gram`).
+        """From an operator with ``lag_kernels()`` and ``polynomials``
+        (:class:`recon.gram.gram.Gram`).
 
         Args:
             gram: the operator.
@@ -45,8 +48,8 @@ class LocalGram:
             scale: factor on the operator.
 
         Raises:
-            ValueError: so many voxels that the blocks would take more than 1.5 GB; an index that is not ``(n, 3)``, or
-                beyond the grid.
+            ValueError: so many voxels that the blocks would take more than 1.5 GB; an index that is
+                not ``(n, 3)``, or beyond the grid.
         """
         ny, nx = gram.grid.shape[-2:]
         shaped("index", index, (None, 3))
@@ -55,8 +58,11 @@ class LocalGram:
             raise ValueError(f"index must lie in the grid of {nz} × {ny} × {nx} voxels, z, y, x")
         kernels = (gram.lag_kernels() * scale).float()
         lags, (py, px) = kernels.shape[1], kernels.shape[-2:]
-        # Lags from −(n − 1) to n − 1 in a row, mirrored along x: the lag falls with the x of the voxel read.
-        kernels = kernels[..., torch.arange(1 - ny, ny) % py, :][..., torch.arange(nx - 1, -nx, -1) % px]
+        # Lags from −(n − 1) to n − 1 in a row, mirrored along x: the lag falls with the x of the
+        # voxel read.
+        kernels = kernels[..., torch.arange(1 - ny, ny) % py, :][
+            ..., torch.arange(nx - 1, -nx, -1) % px
+        ]
         near = np.ascontiguousarray(kernels.permute(1, 2, 0, 3, 4).numpy())
         polynomials = np.ascontiguousarray(gram.polynomials.float().numpy())
         slices = np.searchsorted(index[:, 0], np.arange(nz + 1))
@@ -64,7 +70,8 @@ class LocalGram:
         size = 4 * sum(int(counts[: nz - b] @ counts[b:]) for b in range(lags))
         if size > LARGEST:
             raise ValueError(
-                f"the vessel holds {len(index)} voxels, whose operator would take {size / 1e9:.1f} GB: "
+                f"the vessel holds {len(index)} voxels, whose operator would take "
+                f"{size / 1e9:.1f} GB: "
                 "take larger voxels or a smaller inset"
             )
         planes = [np.ascontiguousarray(index[slices[z] : slices[z + 1], 1:]) for z in range(nz)]
@@ -75,7 +82,16 @@ class LocalGram:
                 if len(planes[z]) and len(planes[z + b]):
                     out = np.empty((len(planes[z + b]), len(planes[z])), np.float32)
                     work = 4 * len(polynomials) * out.shape[1]
-                    run(gather_block, len(out), near[b, z], polynomials, planes[z + b], runs[z], out, operations=work)
+                    run(
+                        gather_block,
+                        len(out),
+                        near[b, z],
+                        polynomials,
+                        planes[z + b],
+                        runs[z],
+                        out,
+                        operations=work,
+                    )
                     blocks[z, b] = out
         return cls(blocks, slices)
 
@@ -132,7 +148,8 @@ class LocalGram:
         return out
 
     def _used(self, x: Floats) -> list[tuple[NDArray[np.int64], Floats]]:
-        """Columns that are not 0 on a slice, and what they are there: a spline's reach only a few slices."""
+        """Columns that are not 0 on a slice, and what they are there: a spline's reach only a
+        few slices."""
         found = []
         for z in range(len(self.slices) - 1):
             part = x[self.slices[z] : self.slices[z + 1]]
@@ -153,7 +170,8 @@ class LocalGram:
 
 
 def _runs(plane: NDArray[np.int64]) -> NDArray[np.int64]:
-    """``(runs, 4)`` y, first x, first position, count of voxels ``(n, 2)`` that lie side by side along x."""
+    """``(runs, 4)`` y, first x, first position, count of voxels ``(n, 2)`` that lie side by side
+    along x."""
     first = np.flatnonzero(np.any(np.diff(plane, axis=0, prepend=-2) != (0, 1), axis=1))
     count = np.diff(first, append=len(plane))
     return np.column_stack([plane[first], first, count])

@@ -1,4 +1,5 @@
-"""The outline of a vessel in its own coordinates: r(θ, s), Fourier orders times B-splines, with a smooth prior."""
+"""The outline of a vessel in its own coordinates: r(θ, s), Fourier orders times B-splines, with
+a smooth prior."""
 
 from __future__ import annotations
 
@@ -18,9 +19,11 @@ Floats = NDArray[np.float64]
 
 _KNOT_MM = 0.9
 _CORRELATION_MM = 2.0
-"""ℓ of the prior's correlation along the vessel, Matérn's of order 5/2: smooth, but for sudden bends."""
+"""ℓ of the prior's correlation along the vessel, Matérn's of order 5/2: smooth, but for sudden
+bends."""
 _SD = (0.4, 0.3, 0.17, 0.06, 0.03)
-"""Prior standard deviation of every order, as a share of the radius: narrow arteries are as round as wide ones."""
+"""Prior standard deviation of every order, as a share of the radius: narrow arteries are as
+round as wide ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +50,8 @@ class OutlineAt:
         return found[0], found[1], found[2]
 
     def spread(self, slope: Floats, out: Any) -> None:
-        """Add slope · dr/d(coefficients) to ``out`` ``(n, splines · (2·orders + 1))``, of any float type."""
+        """Add slope · dr/d(coefficients) to ``out`` ``(n, splines · (2·orders + 1))``, of any
+        float type."""
         outline_spread(slope, self.first, self.spline, self.wave, out)
 
 
@@ -83,15 +87,25 @@ class Outline:
         t = np.clip((s - self.low) / _KNOT_MM, 0.0, self.splines - 3 - 1e-9)
         first = np.floor(t).astype(np.int64)
         u = t - first
-        spline = np.stack([(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3], 1) / 6
-        slope = np.stack([-((1 - u) ** 2), 3 * u**2 - 4 * u, -3 * u**2 + 2 * u + 1, u**2], 1) / (2 * _KNOT_MM)
+        spline = (
+            np.stack(
+                [(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3], 1
+            )
+            / 6
+        )
+        slope = np.stack([-((1 - u) ** 2), 3 * u**2 - 4 * u, -3 * u**2 + 2 * u + 1, u**2], 1) / (
+            2 * _KNOT_MM
+        )
         k = np.arange(1, self.orders + 1)
         c, s_ = np.cos(theta[:, None] * k), np.sin(theta[:, None] * k)
         ones = np.ones((len(theta), 1))
-        return OutlineAt(first, spline, slope, np.hstack([ones, c, s_]), np.hstack([0 * ones, -k * s_, k * c]))
+        return OutlineAt(
+            first, spline, slope, np.hstack([ones, c, s_]), np.hstack([0 * ones, -k * s_, k * c])
+        )
 
     def constant(self, radius: Floats, at: Floats) -> Floats:
-        """Coefficients ``(splines, 2·orders + 1)`` of a round vessel of ``radius`` at positions ``at``, smoothed."""
+        """Coefficients ``(splines, 2·orders + 1)`` of a round vessel of ``radius`` at positions
+        ``at``, smoothed."""
         shape = np.zeros((self.splines, 2 * self.orders + 1))
         centres = self.low + (np.arange(self.splines) - 1) * _KNOT_MM
         weight = np.exp(-0.5 * ((centres[:, None] - at) / _KNOT_MM) ** 2) + 1e-9
@@ -99,7 +113,8 @@ class Outline:
         return shape
 
     def precision(self, radius: float, freedom: float = 1.0, least_order: int = 0) -> Floats:
-        """Prior inverse covariance of all coefficients, mm⁻²; 0 for those of a smaller Fourier order.
+        """Prior inverse covariance of all coefficients, mm⁻²; 0 for those of a smaller Fourier
+        order.
 
         Args:
             radius: of the vessel, mm.

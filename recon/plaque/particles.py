@@ -1,7 +1,8 @@
 """Sequential Monte Carlo: a cloud of parameters that is led from the prior to the posterior.
 
-Del Moral, Doucet, Jasra 2006, "Sequential Monte Carlo samplers": likelihoods to the power of a temperature that rises
-as fast as the weights allow, resampling, and Metropolis moves as wide as the cloud.
+Del Moral, Doucet, Jasra 2006, "Sequential Monte Carlo samplers": likelihoods to the power of a
+temperature that rises as fast as the weights allow, resampling, and Metropolis moves as wide as the
+cloud.
 """
 
 from __future__ import annotations
@@ -39,7 +40,14 @@ class Cloud(NamedTuple):
     log_evidence: float
 
 
-def lead(start: Floats, base: Target, target: Target, rng: np.random.Generator, *, log_evidence: float = 0.0) -> Cloud:
+def lead(
+    start: Floats,
+    base: Target,
+    target: Target,
+    rng: np.random.Generator,
+    *,
+    log_evidence: float = 0.0,
+) -> Cloud:
     """Lead a cloud from one distribution to another.
 
     Args:

@@ -1,4 +1,5 @@
-"""How well the model explains the data: the residual's size, what stands out of it, and texture inside the tissues."""
+"""How well the model explains the data: the residual's size, what stands out of it, and texture
+inside the tissues."""
 
 from __future__ import annotations
 
@@ -28,14 +29,20 @@ PRIOR_VARIANCE_HU2 = 50.0
 _PROBES = 16
 _ENDS_MM = 0.8
 _BODY_MM = (0.4, 1.2)
-"""Gaussians whose difference finds a body of half a millimetre to some millimetres, such as a second vessel."""
+"""Gaussians whose difference finds a body of half a millimetre to some millimetres, such as a
+second vessel."""
 STRIKING = 6.5
-"""Standard deviations of the noise; noise alone reached 4.8 in four volumes, sound readings reached 5.4."""
-_SHARE, _SEEN_HU = 0.25, 60.0
+"""Standard deviations of the noise; noise alone reached 4.8 in four volumes, sound readings
+reached 5.4."""
+_SHARE = 0.25
+_SEEN_HU = 60.0
 """What is beside shows where a smooth estimate has this share of its height, and so much."""
-_APART_MM, _EDGE_MM = 0.2, 0.4
-"""What is beside keeps this distance from the vessel's wall, and reaches so far beyond where it shows."""
-_BESIDE_HU, _BESIDE_STEPS = 500.0, 20
+_APART_MM = 0.2
+_EDGE_MM = 0.4
+"""What is beside keeps this distance from the vessel's wall, and reaches so far beyond where it
+shows."""
+_BESIDE_HU = 500.0
+_BESIDE_STEPS = 20
 """Prior standard deviation of its voxels; conjugate gradients."""
 
 
@@ -61,7 +68,8 @@ class Texture:
     """A Gaussian texture of the soft tissues.
 
     Attributes:
-        sd_hu: √ of the posterior mean of its variance; high_hu: 95 % limit of its standard deviation.
+        sd_hu: √ of the posterior mean of its variance; high_hu: 95 % limit of its standard
+            deviation.
         responses: figure → standard deviation of its estimate by a texture of 1 HU.
     """
 
@@ -70,19 +78,24 @@ class Texture:
     responses: dict[str, float]
 
     def sd_of(self, name: str) -> float:
-        """What the texture adds to the uncertainty of a tissue's value (or of ``"contrast"``), HU."""
+        """What the texture adds to the uncertainty of a tissue's value (or of ``"contrast"``),
+        HU."""
         return self.sd_hu * self.responses.get(name, 0.0)
 
 
 def _between_ends(vessel: Vessel) -> NDArray[np.bool_]:
-    """``(n,)`` voxels of the vessel but for its ends: where a vessel ends is no part of what is read of it."""
+    """``(n,)`` voxels of the vessel but for its ends: where a vessel ends is no part of what is
+    read of it."""
     low, high = vessel.start.ends
-    kept: NDArray[np.bool_] = (vessel.lumen_at.s > low + _ENDS_MM) & (vessel.lumen_at.s < high - _ENDS_MM)
+    kept: NDArray[np.bool_] = (vessel.lumen_at.s > low + _ENDS_MM) & (
+        vessel.lumen_at.s < high - _ENDS_MM
+    )
     return kept
 
 
 def residual_of(vessel: Vessel, fit: Fit, data: TissueData | None = None) -> Tensor:
-    """b − Gx of the whole volume, ``grid.shape`` HU⁻¹; of other data than the fit's if they are given."""
+    """b − Gx of the whole volume, ``grid.shape`` HU⁻¹; of other data than the fit's if they are
+    given."""
     data = data or vessel.data
     image = np.full(vessel.grid.shape, fit.parameters[FAT])
     image[tuple(vessel.index.T)] += fit.drawing.image
@@ -90,10 +103,11 @@ def residual_of(vessel: Vessel, fit: Fit, data: TissueData | None = None) -> Ten
 
 
 def beside(data: TissueData, vessel: Vessel, fit: Fit) -> Tensor | None:
-    """What stands beside a fitted vessel, ``grid.shape`` HU above the fat; None where nothing is striking.
+    """What stands beside a fitted vessel, ``grid.shape`` HU above the fat; None where nothing is
+    striking.
 
-    Least squares over the voxels where the residual shows something, with a prior of no direction or shape: what it
-    is does not matter, only what it does to the vessel.
+    Least squares over the voxels where the residual shows something, with a prior of no direction
+    or shape: what it is does not matter, only what it does to the vessel.
 
     Args:
         data: all that is known, nothing taken off.
@@ -108,17 +122,22 @@ def beside(data: TissueData, vessel: Vessel, fit: Fit) -> Tensor | None:
     if np.abs(scores).max() <= STRIKING:
         return None
     shown = data.pilot(left)
-    bodies, _ = ndimage.label(free & (np.abs(shown) > max(_SHARE * np.abs(shown[free]).max(), _SEEN_HU)))
+    bodies, _ = ndimage.label(
+        free & (np.abs(shown) > max(_SHARE * np.abs(shown[free]).max(), _SEEN_HU))
+    )
     struck = np.unique(bodies[np.abs(scores) > STRIKING])
     there = np.isin(bodies, struck[struck > 0])
     if not there.any():
         return None
-    mask = torch.from_numpy(free & (ndimage.distance_transform_edt(~there, sampling=step) <= _EDGE_MM)).to(left)
+    mask = torch.from_numpy(
+        free & (ndimage.distance_transform_edt(~there, sampling=step) <= _EDGE_MM)
+    ).to(left)
     return data.least_squares(left, _BESIDE_STEPS, mask, _BESIDE_HU**-2)
 
 
 def scores_of(vessel: Vessel, fit: Fit, explained: Tensor | float = 0.0) -> Floats:
-    """How far each place stands out of what a fit leaves of the data, ``grid.shape`` standard deviations of the noise.
+    """How far each place stands out of what a fit leaves of the data, ``grid.shape`` standard
+    deviations of the noise.
 
     0 at the vessel's ends: where a vessel ends is no part of what is read of it.
 
@@ -132,10 +151,12 @@ def scores_of(vessel: Vessel, fit: Fit, explained: Tensor | float = 0.0) -> Floa
 
 
 def leftover(vessel: Vessel, fit: Fit) -> Leftover:
-    """Look through the whole volume for what the tissues do not explain: a second vessel, a branch, a stent, muscle.
+    """Look through the whole volume for what the tissues do not explain: a second vessel, a branch,
+    a stent, muscle.
 
-    The mean square of the residual (:func:`misfit`) averages over a vessel's many voxels, and knows nothing of what
-    lies beside it; a bright neighbour still bends the fit, whose plaque bodies then stand in for it.
+    The mean square of the residual (:func:`misfit`) averages over a vessel's many voxels, and knows
+    nothing of what lies beside it; a bright neighbour still bends the fit, whose plaque bodies then
+    stand in for it.
     """
     data, grid = vessel.data, vessel.grid
     scores = scores_of(vessel, fit)
@@ -145,16 +166,20 @@ def leftover(vessel: Vessel, fit: Fit) -> Leftover:
     z, y, x = (float(axis[k]) for axis, k in zip(grid.axes, place, strict=True))
     beside = bool(inside < 0 or fit.drawing.shares[0][inside] < 0.5)
     return Leftover(
-        score, float(data.pilot(residual_of(vessel, fit))[place]) if score > STRIKING else 0.0, (z, y, x), beside
+        score,
+        float(data.pilot(residual_of(vessel, fit))[place]) if score > STRIKING else 0.0,
+        (z, y, x),
+        beside,
     )
 
 
 def misfit(vessel: Vessel, fit: Fit) -> tuple[float, float]:
-    """Mean square of the standardised residual over its expectation, and its standard deviation under the model."""
+    """Mean square of the standardised residual over its expectation, and its standard deviation
+    under the model."""
     at = vessel.gram.slices
-    variance = np.concatenate([
-        np.diag(vessel.gram.blocks[z, 0]) for z in range(len(at) - 1) if at[z + 1] > at[z]
-    ])  # fmt: skip
+    variance = np.concatenate(
+        [np.diag(vessel.gram.blocks[z, 0]) for z in range(len(at) - 1) if at[z + 1] > at[z]]
+    )
     kept = _between_ends(vessel)
     scale = kept / np.sqrt(variance)
     z = fit.residual * scale
@@ -164,21 +189,25 @@ def misfit(vessel: Vessel, fit: Fit) -> tuple[float, float]:
     total = 0.0
     for (k, b), block in vessel.gram.blocks.items():
         here, there = slice(at[k], at[k + 1]), slice(at[k + b], at[k + b + 1])
-        correlation = (block * scale[there, None].astype(np.float32)) * scale[here].astype(np.float32)
+        correlation = (block * scale[there, None].astype(np.float32)) * scale[here].astype(
+            np.float32
+        )
         total += (2.0 if b else 1.0) * float((correlation**2).sum())
     expected = int(kept.sum()) - float(taken)
     if expected <= 0.0:
         raise ValueError(
-            f"the vessel has {int(kept.sum())} voxels between its ends, too few to test the fit: read a longer part"
+            f"the vessel has {int(kept.sum())} voxels between its ends, too few to test the fit: "
+            "read a longer part"
         )
     return float((z**2).sum() / expected), math.sqrt(2.0 * total) / expected
 
 
 def texture(vessel: Vessel, fit: Fit, rng: np.random.Generator) -> Texture:
-    """Variance of a texture in wall, fibrous layer and core, by the moment rᵀTr of the residual r (T its covariance).
+    """Variance of a texture in wall, fibrous layer and core, by the moment rᵀTr of the residual r
+    (T its covariance).
 
-    With Q the residual's covariance under the model, E[rᵀTr] = tr TQ + τ² tr TQTQ and its variance is 2 tr TQTQ; the
-    traces are estimated with random signs (Hutchinson).
+    With Q the residual's covariance under the model, E[rᵀTr] = tr TQ + τ² tr TQTQ and its variance
+    is 2 tr TQTQ; the traces are estimated with random signs (Hutchinson).
     """
     outer, _, lumen = fit.drawing.shares
     soft = np.clip(outer - lumen, 0.0, 1.0)
@@ -189,7 +218,9 @@ def texture(vessel: Vessel, fit: Fit, rng: np.random.Generator) -> Texture:
     probes = soft[:, None] * smooth(signs)
     single = probes.astype(np.float32)
     taken = fit.curved.T @ single
-    left = vessel.gram.apply(single).astype(np.float64) - fit.curved @ (fit.covariance @ taken).astype(np.float32)
+    left = vessel.gram.apply(single).astype(np.float64) - fit.curved @ (
+        fit.covariance @ taken
+    ).astype(np.float32)
     trace = float((probes * left).sum() / _PROBES)
     back = smooth(soft[:, None] * left)
     square = float((back**2).sum() / _PROBES)
@@ -205,7 +236,11 @@ def texture(vessel: Vessel, fit: Fit, rng: np.random.Generator) -> Texture:
         mean, top = error**2 / -shifted, 3 * error**2 / -shifted
     responses = {}
     p = len(fit.parameters)
-    figures = {"fibrous": {FIBROUS: 1.0}, "core": {FIBROUS: 1.0, p - 1: 1.0}, "contrast": {p - 1: -1.0}}
+    figures = {
+        "fibrous": {FIBROUS: 1.0},
+        "core": {FIBROUS: 1.0, p - 1: 1.0},
+        "contrast": {p - 1: -1.0},
+    }
     for name, wanted in figures.items():
         v = np.zeros(p)
         for k, factor in wanted.items():
@@ -217,7 +252,8 @@ def texture(vessel: Vessel, fit: Fit, rng: np.random.Generator) -> Texture:
 
 
 def _correlating(vessel: Vessel, length_mm: float) -> Callable[[NDArray[Any]], NDArray[Any]]:
-    """A symmetric function that makes of white noise one of unit variance with the correlation exp(−r² / 2ℓ²).
+    """A symmetric function that makes of white noise one of unit variance with the correlation
+    exp(−r² / 2ℓ²).
 
     Args:
         vessel: whose voxels are meant.

@@ -1,4 +1,5 @@
-"""The reading of a vessel: tissues, plaque bodies and their figures, each with an interval, or refused."""
+"""The reading of a vessel: tissues, plaque bodies and their figures, each with an interval, or
+refused."""
 
 from __future__ import annotations
 
@@ -39,14 +40,19 @@ _LOOK = 400
 _LEAST_LOG = 8.0
 """Log evidence of a trial body that makes it worth looking for a calcification."""
 _MOST_BODIES = 3
-_BESIDE, _INSIDE = "a second vessel, a branch, muscle", "more plaque bodies, a stent, another shape"
+_BESIDE = "a second vessel, a branch, muscle"
+_INSIDE = "more plaque bodies, a stent, another shape"
 _ROUNDS = 2
 """Times that what stands beside the vessel is estimated and taken off the data."""
-_APART, _WORTH = 0.2, 0.7
-"""A second core shares at most so much of its volume with the first; from this probability on, by a few hundred trials,
-it is looked for with care."""
-_PURE, _FEW, _LESS_PURE = 0.95, 8, 0.8
-"""Share of a tissue in voxels that are read in other volumes; where there are too few, the second."""
+_APART = 0.2
+_WORTH = 0.7
+"""A second core shares at most so much of its volume with the first; from this probability on, by a
+few hundred trials, it is looked for with care."""
+_PURE = 0.95
+_FEW = 8
+_LESS_PURE = 0.8
+"""Share of a tissue in voxels that are read in other volumes; where there are too few, the
+second."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,24 +62,30 @@ class PlaqueReading:
     Attributes:
         grid: of the data.
         presence: probability that there is a plaque body of another value than the fibrous tissue.
-        second_core: probability of one more core, apart from the first; 0 where the first is not certain. From
-            :data:`CERTAIN` on both are read: one (that at the point) as the core, the other's shape is held where it
-            was found, its figure is the ``second contrast``, ``info["second_core"]`` tells its place and mm³.
-        third_core: what is said of one more that the data show after that: ``at_mm``, ``volume_mm3``, ``contrast_hu``.
+        second_core: probability of one more core, apart from the first; 0 where the first is not
+            certain. From :data:`CERTAIN` on both are read: one (that at the point) as the core, the
+            other's shape is held where it was found, its figure is the ``second contrast``,
+            ``info["second_core"]`` tells its place and mm³.
+        third_core: what is said of one more that the data show after that: ``at_mm``,
+            ``volume_mm3``, ``contrast_hu``.
         calcifications: number of calcified bodies.
-        figures: name → :class:`recon.plaque.figures.Estimate`; the core's are missing where presence is below
-            :data:`CERTAIN`, those of all plaque bodies where the tissues do not explain the data.
+        figures: name → :class:`recon.plaque.figures.Estimate`; the core's are missing where
+            presence is below :data:`CERTAIN`, those of all plaque bodies where the tissues do not
+            explain the data.
         refused: name → why a figure is missing.
-        given_core: the figures of core and calcifications if they are there, however likely that is: for studies of
-            the method, not to be quoted where they are refused.
-        regions: tissue → ``grid.shape`` float32 share of each voxel (posterior mean; the core's if it is there).
+        given_core: the figures of core and calcifications if they are there, however likely that
+            is: for studies of the method, not to be quoted where they are refused.
+        regions: tissue → ``grid.shape`` float32 share of each voxel (posterior mean; the core's if
+            it is there).
         image: ``grid.shape`` float32 HU, the fitted tissues, the core included.
-        chi2: mean square of the residual on the vessel's voxels, but for those at its ends inside of the volume, over
-            its expectation; chi2_sd: its standard deviation under the model.
-        taken_off_hu: largest value beside the vessel that was taken off the data, 0 where nothing was. Otherwise no
-            figure of a plaque body is given: what is left of a neighbour at the vessel's wall is too much like one.
+        chi2: mean square of the residual on the vessel's voxels, but for those at its ends inside
+            of the volume, over its expectation; chi2_sd: its standard deviation under the model.
+        taken_off_hu: largest value beside the vessel that was taken off the data, 0 where nothing
+            was. Otherwise no figure of a plaque body is given: what is left of a neighbour at the
+            vessel's wall is too much like one.
         left: what stands out most of what the tissues leave of the data.
-        texture_hu: standard deviation of a texture of 0.3 mm that the residual shows; texture_high_hu: its 95 % limit.
+        texture_hu: standard deviation of a texture of 0.3 mm that the residual shows;
+            texture_high_hu: its 95 % limit.
         info: settings, and how the fit went.
     """
 
@@ -97,7 +109,8 @@ class PlaqueReading:
 
     @property
     def explained(self) -> bool:
-        """Whether the tissues explain the data; where they do not, no figure of a plaque body is given."""
+        """Whether the tissues explain the data; where they do not, no figure of a plaque body is
+        given."""
         return self.left.score <= STRIKING and abs(self.chi2 - 1.0) <= _MISFIT * self.chi2_sd
 
     @property
@@ -107,10 +120,11 @@ class PlaqueReading:
 
     @property
     def mean_contrast(self) -> float:
-        """Posterior mean of the contrast fibrous − core over a core that is there and one that is not, HU.
+        """Posterior mean of the contrast fibrous − core over a core that is there and one that is
+        not, HU.
 
-        A contrast among the figures is given where the data prove a core, so rather where noise has enlarged it: on
-        average those are too large. This mean is of every reading.
+        A contrast among the figures is given where the data prove a core, so rather where noise has
+        enlarged it: on average those are too large. This mean is of every reading.
         """
         return self.presence * self.given_core["contrast"].value
 
@@ -121,28 +135,36 @@ class PlaqueReading:
         if self.left.score > STRIKING:
             z, y, x = self.left.at_mm
             found.append(
-                f"{'beside' if self.left.beside else 'in'} the vessel, at ({z:.1f}, {y:.1f}, {x:.1f}) mm (z, y, x), "
-                f"the data show {self.left.hu:+.0f} HU ({self.left.score:.0f} standard deviations of the noise) that "
-                f"one vessel in fat does not explain: {_BESIDE if self.left.beside else _INSIDE}? Figures of plaque "
+                f"{'beside' if self.left.beside else 'in'} the vessel, at ({z:.1f}, {y:.1f}, "
+                f"{x:.1f}) mm (z, y, x), "
+                f"the data show {self.left.hu:+.0f} HU ({self.left.score:.0f} standard deviations "
+                "of the noise) that "
+                f"one vessel in fat does not explain: {_BESIDE if self.left.beside else _INSIDE}? "
+                "Figures of plaque "
                 "bodies are refused; do not trust the others"
             )
         if abs(self.chi2 - 1.0) > _MISFIT * self.chi2_sd:
             found.append(
-                f"the residual is {self.chi2:.2f} of what noise leaves ({self.chi2_sd:.2f} standard deviation): "
+                f"the residual is {self.chi2:.2f} of what noise leaves ({self.chi2_sd:.2f} "
+                "standard deviation): "
                 "there is something here that the model does not have; do not trust the intervals"
             )
         if self.third_core is not None:
             z, y, x = self.third_core["at_mm"]
             found.append(
-                f"one more core is there with a probability of {self.third_core['probability']:.2f}, at ({z:.1f}, "
-                f"{y:.1f}, {x:.1f}) mm (z, y, x), of about {self.third_core['volume_mm3']:.1f} mm³ and "
-                f"{self.third_core['contrast_hu']:.0f} HU of contrast: the fitted tissues show fibrous tissue in its "
+                "one more core is there with a probability of "
+                f"{self.third_core['probability']:.2f}, at ({z:.1f}, "
+                f"{y:.1f}, {x:.1f}) mm (z, y, x), of about {self.third_core['volume_mm3']:.1f} "
+                "mm³ and "
+                f"{self.third_core['contrast_hu']:.0f} HU of contrast: the fitted tissues show "
+                "fibrous tissue in its "
                 "place; do not trust the intervals"
             )
         return found
 
     def read(self, volume: Any) -> dict[str, float]:
-        """Mean HU of another volume on the same grid in each region, and the contrast fibrous − core.
+        """Mean HU of another volume on the same grid in each region, and the contrast fibrous −
+        core.
 
         Args:
             volume: ``grid.shape`` HU, tensor or array.
@@ -155,7 +177,8 @@ class PlaqueReading:
 
 @checked
 def core_regions(regions: Mapping[str, Any]) -> dict[str, NDArray[np.bool_]]:
-    """Voxels wholly inside of each region, from the shares of its voxels; regions without such voxels are left out."""
+    """Voxels wholly inside of each region, from the shares of its voxels; regions without such
+    voxels are left out."""
     found = {}
     for name, share in regions.items():
         inside = np.asarray(share) > _PURE
@@ -177,7 +200,9 @@ def read_regions(regions: Mapping[str, Any], volume: Any) -> dict[str, float]:
     values = np.asarray(volume, dtype=np.float64)
     for share in regions.values():
         if values.shape != share.shape:
-            raise ValueError(f"volume must have the reading's shape {share.shape}, got {values.shape}")
+            raise ValueError(
+                f"volume must have the reading's shape {share.shape}, got {values.shape}"
+            )
     found = {name: float(values[inside].mean()) for name, inside in core_regions(regions).items()}
     if "core" in found and "fibrous" in found:
         found["contrast"] = found["fibrous"] - found["core"]
@@ -202,7 +227,8 @@ def read_plaque(
         data: :meth:`TissueData.of_scan`, or any other statistic with its operator.
         point: ``(z, y, x)`` mm where a reader sees the plaque; None: blind, in the largest vessel.
         point_sd: standard deviation of its error along each axis, mm.
-        particles: shapes of the core that are followed; fewer than 300 widen the spread of the result.
+        particles: shapes of the core that are followed; fewer than 300 widen the spread of the
+            result.
         prior: probability of a core before the data.
         vessel_prior: what is believed of the vessel; None: usual tissues.
         seed: of the Monte Carlo.
@@ -211,7 +237,8 @@ def read_plaque(
         The reading. Given equal arguments it is the same.
 
     Raises:
-        ValueError: no enhanced vessel (at the point), no layer that could hold a plaque, values out of range.
+        ValueError: no enhanced vessel (at the point), no layer that could hold a plaque, values out
+            of range.
         TypeError: values of the wrong kind.
     """
     where = None if point is None else numbers("point", point, 3)
@@ -219,7 +246,9 @@ def read_plaque(
     particles, seed = whole("particles", particles, 50), whole("seed", seed, 0)
     prior = number("prior", prior, low=0.0, high=1.0)
     if not isinstance(vessel_prior, VesselPrior | None):
-        raise TypeError(f"vessel_prior must be a recon.plaque.VesselPrior, got {type(vessel_prior).__name__}")
+        raise TypeError(
+            f"vessel_prior must be a recon.plaque.VesselPrior, got {type(vessel_prior).__name__}"
+        )
     rng = np.random.default_rng(seed)
 
     def fitted(seen: TissueData) -> tuple[Vessel, Fit]:
@@ -239,11 +268,16 @@ def read_plaque(
     if stands.score <= STRIKING or not stands.beside:
         # Bodies in the vessel do not explain what lies beside it; they would only stand in for it.
         fit = _calcified(vessel, fit, particles, rng)
-    core = CorePrior(point=None if where is None else (where[0], where[1], where[2]), point_sd=point_sd)
+    core = CorePrior(
+        point=None if where is None else (where[0], where[1], where[2]), point_sd=point_sd
+    )
     reading = _read(vessel, fit, core, particles, prior, rng, seed)
     if not taken:
         return reading
-    why = f"something of {taken:.0f} HU stands beside the vessel: what is left of it is too much like a plaque body"
+    why = (
+        f"something of {taken:.0f} HU stands beside the vessel: what is left of it is too much "
+        "like a plaque body"
+    )
     return replace(
         reading,
         taken_off_hu=taken,
@@ -262,7 +296,10 @@ def _calcified(vessel: Vessel, fit: Fit, particles: int, rng: np.random.Generato
             break
         cloud = lead(tries[:particles], space.nothing, space.target, rng)
         found = space.evidence(space.shares(cloud.points))
-        if not (found.mean.mean() > 0.5 * CALCIFIED_HU and cloud.log_evidence > math.log(CERTAIN / (1 - CERTAIN))):
+        if not (
+            found.mean.mean() > 0.5 * CALCIFIED_HU
+            and cloud.log_evidence > math.log(CERTAIN / (1 - CERTAIN))
+        ):
             break
         # The lumen's outline had taken some of it: its contrast shows in the fit that has the body.
         other = _with_body(vessel, fit, space, cloud, float(found.mean.mean()), expected=True)
@@ -273,35 +310,54 @@ def _calcified(vessel: Vessel, fit: Fit, particles: int, rng: np.random.Generato
 
 
 def _with_body(
-    vessel: Vessel, fit: Fit, space: CoreSpace, cloud: Cloud, contrast: float, expected: bool = False
+    vessel: Vessel,
+    fit: Fit,
+    space: CoreSpace,
+    cloud: Cloud,
+    contrast: float,
+    expected: bool = False,
 ) -> Fit:
     """The vessel fitted again with the mean of a cloud of bodies beside those it has."""
     layer = (fit.drawing.shares[1] - fit.drawing.shares[2])[space.chosen]
     body = np.zeros((1, len(vessel.index)))
     mean = space.shares(cloud.points).mean(0)
-    body[0, space.chosen] = np.where(layer > 0.02, np.clip(mean / np.maximum(layer, 0.02), 0.0, 1.0), 0.0)
-    return vessel.fit(np.append(fit.parameters, contrast), np.concatenate([fit.bodies, body]), expected=expected)
+    body[0, space.chosen] = np.where(
+        layer > 0.02, np.clip(mean / np.maximum(layer, 0.02), 0.0, 1.0), 0.0
+    )
+    return vessel.fit(
+        np.append(fit.parameters, contrast), np.concatenate([fit.bodies, body]), expected=expected
+    )
 
 
 def _doubt(presence: float, contrast: Estimate) -> str:
     """Why the figures of a core must not be given; empty: they may.
 
-    Where two explanations are about as likely (which tissue is the core), the presence is certain and the contrast is
-    not: its interval holds 0.
+    Where two explanations are about as likely (which tissue is the core), the presence is certain
+    and the contrast is not: its interval holds 0.
     """
     if presence < CERTAIN:
         return f"a core is there with a probability of {presence:.2f} only"
     if contrast.low <= 0.0 <= contrast.high:
-        return f"the contrast lies between {contrast.low:.0f} and {contrast.high:.0f} HU: several explanations fit"
+        return (
+            f"the contrast lies between {contrast.low:.0f} and {contrast.high:.0f} HU: several "
+            "explanations fit"
+        )
     return ""
 
 
 def _read(
-    vessel: Vessel, fit: Fit, prior_of_core: CorePrior, particles: int, prior: float, rng: np.random.Generator,
-    seed: int, other_core: Mapping[str, Any] | None = None,
-) -> PlaqueReading:  # fmt: skip
+    vessel: Vessel,
+    fit: Fit,
+    prior_of_core: CorePrior,
+    particles: int,
+    prior: float,
+    rng: np.random.Generator,
+    seed: int,
+    other_core: Mapping[str, Any] | None = None,
+) -> PlaqueReading:
     others = len(fit.bodies)
-    calcifications = others - (other_core is not None)  # the other core is the last of the fit's bodies
+    # the other core is the last of the fit's bodies
+    calcifications = others - (other_core is not None)
     plain = fit
     space = CoreSpace(vessel, fit, prior_of_core)
     cloud = lead(space.draw_prior(particles, rng), space.nothing, space.target, rng)
@@ -312,8 +368,8 @@ def _read(
         other = _with_body(vessel, fit, space, cloud, float(seen.mean.mean()), expected=True)
         if other.parameters[-1] > CALCIFIED_HU:
             return _read(vessel, other, prior_of_core, particles, prior, rng, seed)
-    # The vessel was fitted without a core, its tissues as expected. Now they are free: without a core, for comparison;
-    # with the one that was found; and then the core again.
+    # The vessel was fitted without a core, its tissues as expected. Now they are free: without a
+    # core, for comparison; with the one that was found; and then the core again.
     without = CoreSpace(vessel, vessel.fit(fit.parameters, fit.bodies), prior_of_core)
     fit = _with_body(vessel, fit, space, cloud, float(seen.mean.mean()))
     again = CoreSpace(vessel, fit, prior_of_core, replaces=others, against=without.none)
@@ -324,8 +380,15 @@ def _read(
     shares = space.shares(cloud.points)
     tau = texture(vessel, fit, rng)
     draws = draws_of(vessel, fit, space, cloud.points, shares, tau, rng)
-    names = {"fat": "HU", "wall": "HU", "fibrous": "HU", "lumen": "HU", "wall thickness": "mm", "lumen area": "mm²",
-             "least lumen area": "mm²"}  # fmt: skip
+    names = {
+        "fat": "HU",
+        "wall": "HU",
+        "fibrous": "HU",
+        "lumen": "HU",
+        "wall thickness": "mm",
+        "lumen area": "mm²",
+        "least lumen area": "mm²",
+    }
     plaque = {"contrast": "HU", "core": "HU", "core volume": "mm³", "cap thickness": "mm"}
     given = {n: estimate(draws[n], unit) for n, unit in plaque.items()}
     figures = {n: estimate(draws[n], unit) for n, unit in names.items() if n in draws}
@@ -334,35 +397,74 @@ def _read(
     for k in range(calcifications):
         i = vessel.size + k
         sd, value = math.sqrt(fit.covariance[i, i]), fit.parameters[i] + fit.parameters[FIBROUS]
-        given[f"calcification {k + 1}"] = Estimate(value, value - 1.96 * sd, value + 1.96 * sd, sd, "HU")
+        given[f"calcification {k + 1}"] = Estimate(
+            value, value - 1.96 * sd, value + 1.96 * sd, sd, "HU"
+        )
     if other_core is not None:
         i = vessel.size + calcifications
-        # The fit holds the other core's shape; its uncertainty is that of the shapes which were found.
-        sd = math.hypot(math.sqrt(fit.covariance[i, i]), tau.sd_of("contrast"), other_core["contrast_sd_hu"])
+        # The fit holds the other core's shape; its uncertainty is that of the shapes which were
+        # found.
+        sd = math.hypot(
+            math.sqrt(fit.covariance[i, i]), tau.sd_of("contrast"), other_core["contrast_sd_hu"]
+        )
         value = -float(fit.parameters[i])
         given["second contrast"] = Estimate(value, value - 1.96 * sd, value + 1.96 * sd, sd, "HU")
-    more, found = (0.0, None) if presence < CERTAIN else _one_more(vessel, fit, shares.mean(0), space, particles, rng)
+    more, found = (
+        (0.0, None)
+        if presence < CERTAIN
+        else _one_more(vessel, fit, shares.mean(0), space, particles, rng)
+    )
     if found is not None and other_core is None:
         where, cloud_there, contrast_there = found
         told = _core_told(where, cloud_there, contrast_there, more)
         both = _read(
-            vessel, _with_body(vessel, plain, where, cloud_there, contrast_there, expected=True), prior_of_core,
-            particles, prior, rng, seed, told,
-        )  # fmt: skip
+            vessel,
+            _with_body(vessel, plain, where, cloud_there, contrast_there, expected=True),
+            prior_of_core,
+            particles,
+            prior,
+            rng,
+            seed,
+            told,
+        )
         if both.presence >= CERTAIN:
             return both
     reading = PlaqueReading(
-        vessel.grid, presence, more if other_core is None else other_core["probability"], calcifications, figures, {},
-        given, _regions(vessel, fit, space, shares, calcifications), fit.image, square, spread, left, tau.sd_hu,
+        vessel.grid,
+        presence,
+        more if other_core is None else other_core["probability"],
+        calcifications,
+        figures,
+        {},
+        given,
+        _regions(vessel, fit, space, shares, calcifications),
+        fit.image,
+        square,
+        spread,
+        left,
+        tau.sd_hu,
         tau.high_hu,
-        {"particles": particles, "seed": seed, "log_evidence": cloud.log_evidence, "log_evidence_first": first,
-         "point": prior_of_core.point, "vessel_prior": asdict(vessel.prior), "voxels": len(vessel.index),
-         "core_center_mm": cloud.points[:, :3].mean(0).tolist(), "prior": prior, "second_core": other_core},
+        {
+            "particles": particles,
+            "seed": seed,
+            "log_evidence": cloud.log_evidence,
+            "log_evidence_first": first,
+            "point": prior_of_core.point,
+            "vessel_prior": asdict(vessel.prior),
+            "voxels": len(vessel.index),
+            "core_center_mm": cloud.points[:, :3].mean(0).tolist(),
+            "prior": prior,
+            "second_core": other_core,
+        },
         third_core=None if found is None else _core_told(*found, more),
-    )  # fmt: skip
+    )
     why = "" if reading.explained else "the tissues do not explain the data, see the warning"
     doubt = why or _doubt(presence, given["contrast"])
-    refused = {name: doubt if name in plaque else why for name in given if (doubt if name in plaque else why)}
+    refused = {
+        name: doubt if name in plaque else why
+        for name in given
+        if (doubt if name in plaque else why)
+    }
     shown = {name: e for name, e in given.items() if name not in refused}
     return replace(reading, figures=figures | shown, refused=refused)
 
@@ -372,9 +474,15 @@ def _probability(log_odds: float) -> float:
 
 
 def _one_more(
-    vessel: Vessel, fit: Fit, core: NDArray[np.float32], space: CoreSpace, particles: int, rng: np.random.Generator
+    vessel: Vessel,
+    fit: Fit,
+    core: NDArray[np.float32],
+    space: CoreSpace,
+    particles: int,
+    rng: np.random.Generator,
 ) -> tuple[float, tuple[CoreSpace, Cloud, float] | None]:
-    """Probability of one more core than the fit has, as likely as none before the data, anywhere in the layer.
+    """Probability of one more core than the fit has, as likely as none before the data, anywhere in
+    the layer.
 
     Bodies that overlap the first core count as none: they would mend its shape.
 
@@ -407,12 +515,18 @@ def _one_more(
     return probability, (more, cloud, float(more.evidence(more.shares(cloud.points)).mean.mean()))
 
 
-def _core_told(space: CoreSpace, cloud: Cloud, contrast: float, probability: float) -> dict[str, Any]:
+def _core_told(
+    space: CoreSpace, cloud: Cloud, contrast: float, probability: float
+) -> dict[str, Any]:
     """Place, size and value of a core beside the first."""
     seen = space.evidence(space.shares(cloud.points))
-    return {"probability": probability, "at_mm": cloud.points[:, :3].mean(0).tolist(), "contrast_hu": -contrast,
-            "contrast_sd_hu": math.sqrt(float(seen.mean.var() + seen.variance.mean())),
-            "volume_mm3": float(seen.volume.mean())}  # fmt: skip
+    return {
+        "probability": probability,
+        "at_mm": cloud.points[:, :3].mean(0).tolist(),
+        "contrast_hu": -contrast,
+        "contrast_sd_hu": math.sqrt(float(seen.mean.var() + seen.variance.mean())),
+        "volume_mm3": float(seen.volume.mean()),
+    }
 
 
 def _regions(
@@ -421,8 +535,13 @@ def _regions(
     core = np.zeros(len(vessel.index))
     core[space.chosen] = shares.mean(0)
     soft = fit.bodies[:-1] * np.clip(fit.drawing.shares[1] - fit.drawing.shares[2], 0.0, 1.0)
-    outer, inner, lumen, core, *bodies = vessel.voxel_means(np.stack([*fit.drawing.shares, core, *soft], 1)).T
-    layer, hard = np.clip(inner - lumen, 0.0, 1.0), sum(bodies[:calcifications], np.zeros(len(core)))
+    outer, inner, lumen, core, *bodies = vessel.voxel_means(
+        np.stack([*fit.drawing.shares, core, *soft], 1)
+    ).T
+    layer, hard = (
+        np.clip(inner - lumen, 0.0, 1.0),
+        sum(bodies[:calcifications], np.zeros(len(core))),
+    )
     core = np.clip(core, 0.0, layer)
     rest = layer - core - sum(bodies, np.zeros(len(core)))
     parts = {"wall": outer - inner, "fibrous": rest, "lumen": lumen, "core": core}

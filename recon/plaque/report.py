@@ -18,21 +18,33 @@ from torchpcct.volume import Volume
 
 __all__ = ["picture", "save", "table"]
 
-_COLOURS = {"lumen": "tab:red", "fibrous": "tab:orange", "wall": "tab:blue", "core": "lime", "calcification": "white",
-            "second core": "lime"}  # fmt: skip
+_COLOURS = {
+    "lumen": "tab:red",
+    "fibrous": "tab:orange",
+    "wall": "tab:blue",
+    "core": "lime",
+    "calcification": "white",
+    "second core": "lime",
+}
 
 
 Deviations = Mapping[str, Mapping[str, float]]
 """Volume → region → standard deviation of its mean, HU."""
 
 
-def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None, deviations: Deviations | None = None) -> str:
-    """Markdown: every figure with its 95 % interval, and what other volumes read over the same regions.
+def table(
+    reading: PlaqueReading,
+    others: Mapping[str, Any] | None = None,
+    deviations: Deviations | None = None,
+) -> str:
+    """Markdown: every figure with its 95 % interval, and what other volumes read over the same
+    regions.
 
     Args:
         reading: to tell.
         others: name → volume in HU on the reading's grid.
-        deviations: of their means, where they are known (:func:`recon.plaque.beside.fbp_deviations`).
+        deviations: of their means, where they are known
+            (:func:`recon.plaque.beside.fbp_deviations`).
     """
     sd = deviations or {}
     read = {name: reading.read(volume) for name, volume in (others or {}).items()}
@@ -48,7 +60,10 @@ def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None, devia
             else "the tissues do not explain the data, see the warning"
         ),
         "",
-        " | ".join(["| figure", "tissues as unknowns [95 %]", *(f"{name}, same regions" for name in read)]) + " |",
+        " | ".join(
+            ["| figure", "tissues as unknowns [95 %]", *(f"{name}, same regions" for name in read)]
+        )
+        + " |",
         "|---" * (2 + len(read)) + "|",
     ]
     for name, e in reading.figures.items():
@@ -57,7 +72,9 @@ def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None, devia
         for other, r in read.items():
             error = sd.get(other, {}).get(name)
             cells.append(
-                "–" if name not in r else f"{r[name]:.{digits}f}" + ("" if error is None else f" ± {error:.1f}")
+                "–"
+                if name not in r
+                else f"{r[name]:.{digits}f}" + ("" if error is None else f" ± {error:.1f}")
             )
         lines.append(" | ".join([f"| {name}", *cells]) + " |")
     for name, why in reading.refused.items():
@@ -67,23 +84,31 @@ def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None, devia
         z, y, x = second["at_mm"]
         lines += [
             "",
-            f"A second core is there with a probability of {second['probability']:.3f}, at ({z:.1f}, {y:.1f}, {x:.1f}) "
-            f"mm (z, y, x), of about {second['volume_mm3']:.1f} mm³. Both were read together; the figures are those of "
+            f"A second core is there with a probability of {second['probability']:.3f}, at "
+            f"({z:.1f}, {y:.1f}, {x:.1f}) "
+            f"mm (z, y, x), of about {second['volume_mm3']:.1f} mm³. Both were read together; the "
+            "figures are those of "
             "the first, but for the second contrast.",
         ]
     if reading.explained and not reading.taken_off_hu:
         lines += [
             "",
-            f"Contrast over a core that is there and one that is not: {reading.mean_contrast:.0f} HU. A contrast is "
-            "given where the data prove a core, so rather where noise has enlarged it: on average those given are too "
+            f"Contrast over a core that is there and one that is not: {reading.mean_contrast:.0f} "
+            "HU. A contrast is "
+            "given where the data prove a core, so rather where noise has enlarged it: on average "
+            "those given are too "
             "large.",
         ]
     lines += [
         "",
         f"Residual: {reading.chi2:.3f} ± {reading.chi2_sd:.3f} of what noise "
-        f"leaves. Texture of 0.3 mm: {reading.texture_hu:.0f} HU, at most {reading.texture_high_hu:.0f} HU (95 %). "
+        f"leaves. Texture of 0.3 mm: {reading.texture_hu:.0f} HU, at most "
+        f"{reading.texture_high_hu:.0f} HU (95 %). "
         "Believed before the data: "
-        + ", ".join("{} {:g} ± {:g} HU".format(n, *reading.info["vessel_prior"][n]) for n in ("wall", "fibrous"))
+        + ", ".join(
+            "{} {:g} ± {:g} HU".format(n, *reading.info["vessel_prior"][n])
+            for n in ("wall", "fibrous")
+        )
         + ".",
         *(f"Warning: {text}." for text in reading.warnings),
     ]
@@ -93,27 +118,39 @@ def table(reading: PlaqueReading, others: Mapping[str, Any] | None = None, devia
 def _hidden(reading: PlaqueReading) -> set[str]:
     """Plaque bodies that a reading must not show: fibrous tissue in their place."""
     told = reading.explained and not reading.taken_off_hu
-    return (set() if told else {"calcification"}) | (set() if reading.certain else {"core", "second core"})
+    return (set() if told else {"calcification"}) | (
+        set() if reading.certain else {"core", "second core"}
+    )
 
 
 def picture(reading: PlaqueReading, others: Mapping[str, Any] | None = None) -> Any:
-    """Sections across and along z through the core's centre: other volumes with the outlines, and the fitted tissues.
+    """Sections across and along z through the core's centre: other volumes with the outlines, and
+    the fitted tissues.
 
     Returns:
         ``matplotlib.figure.Figure``.
     """
     grid = reading.grid
     centre = np.array(reading.info["core_center_mm"])
-    index = [int(np.clip(round((c - a[0]) / s), 0, n - 1))
-             for c, a, s, n in zip(centre, grid.axes, grid.spacing, grid.shape, strict=True)]  # fmt: skip
-    (z0, z1), (y0, y1), (x0, x1) = ((a[0] - s / 2, a[-1] + s / 2) for a, s in zip(grid.axes, grid.spacing, strict=True))
+    index = [
+        int(np.clip(round((c - a[0]) / s), 0, n - 1))
+        for c, a, s, n in zip(centre, grid.axes, grid.spacing, grid.shape, strict=True)
+    ]
+    (z0, z1), (y0, y1), (x0, x1) = (
+        (a[0] - s / 2, a[-1] + s / 2) for a, s in zip(grid.axes, grid.spacing, strict=True)
+    )
     hidden = _hidden(reading)
     shown = {k: v for k, v in _COLOURS.items() if k in reading.regions and k not in hidden}
     rows = []
-    for cut, extent in (((index[0],), (x0, x1, y0, y1)), ((slice(None), index[1]), (x0, x1, z0, z1))):
+    for cut, extent in (
+        ((index[0],), (x0, x1, y0, y1)),
+        ((slice(None), index[1]), (x0, x1, z0, z1)),
+    ):
         outlines = tuple((reading.regions[k][cut] > 0.5, colour) for k, colour in shown.items())
         images = {**(others or {}), "fitted tissues": reading.image}
-        rows.append([Panel(np.asarray(v)[cut], extent, name, outlines) for name, v in images.items()])
+        rows.append(
+            [Panel(np.asarray(v)[cut], extent, name, outlines) for name, v in images.items()]
+        )
     return panels(rows, ("axial", "coronal"), title=f"plaque body: P = {reading.presence:.2f}")
 
 
@@ -123,10 +160,11 @@ def save(
     others: Mapping[str, Any] | None = None,
     deviations: Deviations | None = None,
 ) -> list[Path]:
-    """Write ``report.md``, ``report.json``, ``tissues.nii.gz`` (labels), ``image.nii.gz`` and ``plaque.png``.
+    """Write ``report.md``, ``report.json``, ``tissues.nii.gz`` (labels), ``image.nii.gz`` and
+    ``plaque.png``.
 
-    Labels: 0 fat, 1 wall, 2 fibrous, 3 lumen, 4 core, 5 calcification, 6 second core; cores only where they are
-    certain, and no plaque body where none can be told.
+    Labels: 0 fat, 1 wall, 2 fibrous, 3 lumen, 4 core, 5 calcification, 6 second core; cores only
+    where they are certain, and no plaque body where none can be told.
 
     Args:
         reading: to write.
@@ -170,4 +208,7 @@ def save(
     Volume(torch.from_numpy(reading.image), reading.grid).save(folder / "image.nii.gz")
     with atomic_write(folder / "plaque.png") as part:
         picture(reading, others).savefig(part)
-    return [folder / n for n in ("report.md", "report.json", "tissues.nii.gz", "image.nii.gz", "plaque.png")]
+    return [
+        folder / n
+        for n in ("report.md", "report.json", "tissues.nii.gz", "image.nii.gz", "plaque.png")
+    ]

@@ -17,13 +17,17 @@ __all__ = ["find_vessel", "require_within"]
 Floats = NDArray[np.float64]
 
 _BALLS_MM = (1.8, 0.9)
-"""Larger than any lumen's radius; and for a narrow one, whose noise along it holds the walk of a large ball back."""
+"""Larger than any lumen's radius; and for a narrow one, whose noise along it holds the walk of a
+large ball back."""
 _LEAST_STEP_HU = 120.0
 _LEAST_LUMEN_HU = 270.0
-"""Where the lumen stands out less, its outline is that of the noise: fibrous tissue is up to 240 HU above fat."""
-_LUMEN_AT, _WALL_AT = 0.69, 0.175
-"""Where between the surroundings and the lumen their outlines are first looked for: half-way between fat and wall,
-half-way between fibrous tissue and lumen, wherever the scanner's zero lies."""
+"""Where the lumen stands out less, its outline is that of the noise: fibrous tissue is up to 240
+HU above fat."""
+_LUMEN_AT = 0.69
+_WALL_AT = 0.175
+"""Where between the surroundings and the lumen their outlines are first looked for: half-way
+between fat and wall, half-way between fibrous tissue and lumen, wherever the scanner's zero lies.
+"""
 _LEAST_LENGTH_MM = 2.0
 _LEAST_SECTIONS = 4
 """A line needs so many points."""
@@ -38,8 +42,8 @@ def find_vessel(pilot: Floats, grid: VolumeGrid, point: Floats | None) -> Start:
         point: ``(3,)`` z, y, x mm, or None.
 
     Raises:
-        ValueError: a point outside of the grid, no lumen brighter than its surroundings, a bright thing that cannot be
-            followed as a vessel.
+        ValueError: a point outside of the grid, no lumen brighter than its surroundings, a bright
+            thing that cannot be followed as a vessel.
     """
     origin, step = np.array([a[0] for a in grid.axes]), np.array(grid.spacing)
     fat = float(np.median(pilot))
@@ -56,7 +60,9 @@ def find_vessel(pilot: Floats, grid: VolumeGrid, point: Floats | None) -> Start:
     else:
         require_within(point, grid)
         at = (point - origin) / step
-        near, places = ndimage.distance_transform_edt(labels == 0, sampling=step, return_indices=True)
+        near, places = ndimage.distance_transform_edt(
+            labels == 0, sampling=step, return_indices=True
+        )
         index = tuple(np.clip(np.rint(at).astype(int), 0, np.array(grid.shape) - 1))
         if near[index] > 4.0:
             raise ValueError(f"no vessel within 4 mm of the point {point.tolist()} mm (z, y, x)")
@@ -70,8 +76,10 @@ def find_vessel(pilot: Floats, grid: VolumeGrid, point: Floats | None) -> Start:
         middle = voxels[np.argsort(np.linalg.norm(voxels - point, axis=1))[:50]].mean(0)
     if blood - fat < _LEAST_LUMEN_HU:
         raise ValueError(
-            f"the brightest tissue at {np.round(middle, 1).tolist()} mm (z, y, x) reads {blood:.0f} HU in surroundings "
-            f"of {fat:.0f} HU: the outline of a lumen is determined only with contrast agent (at least "
+            f"the brightest tissue at {np.round(middle, 1).tolist()} mm (z, y, x) reads "
+            f"{blood:.0f} HU in surroundings "
+            f"of {fat:.0f} HU: the outline of a lumen is determined only with contrast agent (at "
+            "least "
             f"{_LEAST_LUMEN_HU:.0f} HU above fat)"
         )
     half = fat + _LUMEN_AT * (blood - fat)
@@ -92,7 +100,11 @@ def find_vessel(pilot: Floats, grid: VolumeGrid, point: Floats | None) -> Start:
     outside, _ = ndimage.label(pilot > wall)
     vessel = outside == outside[at]
     low, high = max(ends[0], -0.5), min(ends[1], lumen_line.length + 0.5)
-    _require(high - low >= _LEAST_LENGTH_MM, middle, f"its lumen is followed over {max(high - low, 0.0):.1f} mm only")
+    _require(
+        high - low >= _LEAST_LENGTH_MM,
+        middle,
+        f"its lumen is followed over {max(high - low, 0.0):.1f} mm only",
+    )
     s2, centres2, radii2 = sections(ndimage.binary_fill_holes(vessel), grid, lumen_line, low, high)
     _require(len(s2) >= _LEAST_SECTIONS, middle, "its outer wall is not seen")
     outer_line = Centreline(smooth_line(centres2))
@@ -106,7 +118,8 @@ def require_within(point: Any, grid: VolumeGrid) -> None:
     low = np.array([a[0] for a in grid.axes]) - 0.5 * np.array(grid.spacing)
     if np.any(np.asarray(point) < low) or np.any(np.asarray(point) > low + np.array(grid.extent)):
         raise ValueError(
-            f"the point {np.asarray(point).tolist()} mm (z, y, x) lies outside of the volume, which reaches from "
+            f"the point {np.asarray(point).tolist()} mm (z, y, x) lies outside of the volume, "
+            "which reaches from "
             f"{np.round(low, 2).tolist()} to {np.round(low + np.array(grid.extent), 2).tolist()} mm"
         )
 
@@ -115,6 +128,7 @@ def _require(seen: bool, at: Floats, why: str) -> None:
     """Refuse (ValueError) what cannot be followed as a vessel."""
     if not seen:
         raise ValueError(
-            f"the bright region at {np.round(at, 1).tolist()} mm (z, y, x) is no vessel that can be read: {why}. Metal "
+            f"the bright region at {np.round(at, 1).tolist()} mm (z, y, x) is no vessel that can "
+            f"be read: {why}. Metal "
             "(a stent), bone and noise are as bright; give a point in a lumen with contrast agent"
         )

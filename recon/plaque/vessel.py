@@ -1,14 +1,16 @@
-"""A vessel as tissues with outlines: fat, wall, fibrous layer, lumen; drawn on the grid, and fitted to the data.
+"""A vessel as tissues with outlines: fat, wall, fibrous layer, lumen; drawn on the grid, and fitted
+to the data.
 
     x = fat + (wall − fat) O + (fibrous − wall) I + (lumen − fibrous) L + Σ δ_k B_k
 
-O, I and L are the shares at each voxel inside the vessel, inside its wall and in the lumen, B_k those of plaque bodies
-in the fibrous layer. The wall is of one thickness; a lumen may cross it in the model, so that a layer of no thickness
-is estimated without bias.
+O, I and L are the shares at each voxel inside the vessel, inside its wall and in the lumen, B_k
+those of plaque bodies in the fibrous layer. The wall is of one thickness; a lumen may cross it in
+the model, so that a layer of no thickness is estimated without bias.
 
-A voxel's mean, projected as a box, is averaged twice: a lumen of 2 mm on voxels of 0.2 mm then reads 5 HU too much. So
-an outline is drawn as an error function, soft enough for the voxels to hold it without aliasing, and what it and the
-operator's box average is taken off again (:func:`recon.plaque.kernels.sharpened`): x is what the operator takes.
+A voxel's mean, projected as a box, is averaged twice: a lumen of 2 mm on voxels of 0.2 mm then
+reads 5 HU too much. So an outline is drawn as an error function, soft enough for the voxels to hold
+it without aliasing, and what it and the operator's box average is taken off again
+(:func:`recon.plaque.kernels.sharpened`): x is what the operator takes.
 """
 
 from __future__ import annotations
@@ -35,37 +37,52 @@ __all__ = ["FAT", "FIBROUS", "LUMEN", "THICKNESS", "WALL", "Drawing", "Fit", "St
 
 Floats = NDArray[np.float64]
 
-FAT, WALL, FIBROUS, LUMEN, THICKNESS, BLUR, ENDS = 0, 1, 2, 3, 4, 5, 6
+FAT = 0
+WALL = 1
+FIBROUS = 2
+LUMEN = 3
+THICKNESS = 4
+BLUR = 5
+ENDS = 6
 _FIRST = 12
-"""Positions of the first parameters: values, logs of the wall thickness and of the edges' blur, three for each end
-(position and tilts of a plane); then the lumen's and the outer outline's coefficients."""
+"""Positions of the first parameters: values, logs of the wall thickness and of the edges' blur,
+three for each end (position and tilts of a plane); then the lumen's and the outer outline's
+coefficients."""
 
-_FAT_SD, _LUMEN_SD = 100.0, 300.0
+_FAT_SD = 100.0
+_LUMEN_SD = 300.0
 """Prior of fat and lumen about what the start reads, HU."""
 _EXPECTED_SD = (10.0, 15.0)
 """Of wall and fibrous tissue, HU, in a fit that expects them to be what they usually are."""
 _EXPECTED_ROUND = 4.0
-"""So much less than else the outlines leave an ellipse in such a fit: a calcification beside the lumen would otherwise
-be taken for a bulge of it, and leave no trace."""
-_WALL_MM, _WALL_LOG_SD = 0.2, 0.2
-_BLUR_MM2, _BLUR_LOG_SD = 0.004, 0.7
-"""Variance by which edges are softer than the operator's, and standard deviation of its logarithm: a focal spot of
-0.5 mm makes 0.004 mm² at half of the distance to the detector, one of 1 mm makes 0.016."""
+"""So much less than else the outlines leave an ellipse in such a fit: a calcification beside the
+lumen would otherwise be taken for a bulge of it, and leave no trace."""
+_WALL_MM = 0.2
+_WALL_LOG_SD = 0.2
+_BLUR_MM2 = 0.004
+_BLUR_LOG_SD = 0.7
+"""Variance by which edges are softer than the operator's, and standard deviation of its logarithm:
+a focal spot of 0.5 mm makes 0.004 mm² at half of the distance to the detector, one of 1 mm makes
+0.016."""
 SOFT = 0.5
-"""Standard deviation of an outline as drawn, in voxels: narrower aliases, wider needs more of what noise hides."""
+"""Standard deviation of an outline as drawn, in voxels: narrower aliases, wider needs more of
+what noise hides."""
 _LEFT = 0.06
-"""Squared voxels that sharpening to second order leaves of an outline's softness in the plane: fits of vessels painted
-on finer voxels, without any blur, ask for outlines so much harder (0.058 on voxels of 0.2 mm, 0.068 on 0.3 mm)."""
+"""Squared voxels that sharpening to second order leaves of an outline's softness in the plane: fits
+of vessels painted on finer voxels, without any blur, ask for outlines so much harder (0.058 on
+voxels of 0.2 mm, 0.068 on 0.3 mm)."""
 BOX = 1 / 12
-"""Variance of a voxel's box, in squared voxels: the operator takes a value for that of a whole voxel."""
+"""Variance of a voxel's box, in squared voxels: the operator takes a value for that of a whole
+voxel."""
 EXCESS = SOFT**2 + BOX
 """Variance of outline and operator together, in squared voxels."""
 _END_SD_MM = (1.0, 0.1, 0.1)
 _FAR = 15.0
-"""A step that gains more of the log posterior than this, or less than half of what its linear model says, makes the
-curvature worth computing again."""
+"""A step that gains more of the log posterior than this, or less than half of what its linear model
+says, makes the curvature worth computing again."""
 _SHORTER = 3
-"""Lengths of a step that are tried: the noise of single voxels bends the energy more than its linear model says."""
+"""Lengths of a step that are tried: the noise of single voxels bends the energy more than its
+linear model says."""
 _DAMPING = 0.03
 """First share of the Hessian's diagonal that is added where no length of a step leads down."""
 _MARGIN_MM = 0.6
@@ -99,9 +116,11 @@ class Drawing:
     """A vessel drawn on its voxels.
 
     Attributes:
-        soft: ``(n,)`` HU above fat, outlines of ``SOFT``; shares: ``(3, n)`` outer, inner, lumen, likewise.
+        soft: ``(n,)`` HU above fat, outlines of ``SOFT``; shares: ``(3, n)`` outer, inner, lumen,
+            likewise.
         image: ``(n,)`` HU above fat, as the operator takes it.
-        jacobian: ``(n, parameters)`` float32, of ``image``, HU per unit; None where it was not asked for.
+        jacobian: ``(n, parameters)`` float32, of ``image``, HU per unit; None where it was not
+            asked for.
         lumen_distance, inner_distance: ``(n,)`` mm, negative inside.
         lumen_sd: ``(n,)`` mm, softness of the lumen's outline; lumen_normal: ``(n, 3)``.
     """
@@ -178,18 +197,23 @@ class Fit:
     def layer(self) -> Floats:
         """``(n,)`` share of each voxel in the fibrous layer, less its bodies."""
         _, inner, lumen = self.drawing.shares
-        share: Floats = np.clip(inner - lumen, 0.0, 1.0) * np.clip(1.0 - self.bodies.sum(0), 0.0, 1.0)
+        share: Floats = np.clip(inner - lumen, 0.0, 1.0) * np.clip(
+            1.0 - self.bodies.sum(0), 0.0, 1.0
+        )
         return share
 
 
 def _behind(distance: Floats, variance: Floats) -> tuple[Floats, Floats]:
-    """Share behind a soft edge at a signed distance (negative: behind), and its derivative by −distance."""
+    """Share behind a soft edge at a signed distance (negative: behind), and its derivative by
+    −distance."""
     sd = np.sqrt(variance)
     t = distance / sd
-    # Beyond, 1e-18 of an edge is left. It counts for nothing, but as float32 becomes numbers so small that products
-    # with them take a hundred times as long.
+    # Beyond, 1e-18 of an edge is left. It counts for nothing, but as float32 becomes numbers so
+    # small that products with them take a hundred times as long.
     near = np.abs(t) < _TAIL
-    return np.where(near | (t < 0.0), ndtr(-t), 0.0), near * np.exp(-0.5 * t * t) / (math.sqrt(2.0 * math.pi) * sd)
+    return np.where(near | (t < 0.0), ndtr(-t), 0.0), near * np.exp(-0.5 * t * t) / (
+        math.sqrt(2.0 * math.pi) * sd
+    )
 
 
 class Vessel:
@@ -217,7 +241,8 @@ class Vessel:
         kept = (along > start.ends[0] - _MARGIN_MM) & (along < start.ends[1] + _MARGIN_MM)
         flat, own = wide[kept], np.flatnonzero(beside)[kept]
         self.index = np.stack(np.unravel_index(flat, grid.shape), 1).astype(np.int64)
-        self.lookup = np.full(grid.shape, -1, np.int64)  # position of each of the grid's voxels in the index
+        # position of each of the grid's voxels in the index
+        self.lookup = np.full(grid.shape, -1, np.int64)
         self.lookup.ravel()[flat] = np.arange(len(flat))
         self.points = points[flat]
         self.sd = SOFT * np.array(grid.spacing)
@@ -225,10 +250,17 @@ class Vessel:
         self.lumen_at = start.lumen.coordinates(self.points)
         low, high = min(low, float(self.lumen_at.s.min())), max(high, float(self.lumen_at.s.max()))
         self.lumen_outline = Outline(low, high, self.prior.orders)
-        self.outer_outline = Outline(float(self.outer_at.s.min()), float(self.outer_at.s.max()), self.prior.orders)
-        self._lumen, self._outer = self.lumen_outline.at(self.lumen_at), self.outer_outline.at(self.outer_at)
+        self.outer_outline = Outline(
+            float(self.outer_at.s.min()), float(self.outer_at.s.max()), self.prior.orders
+        )
+        self._lumen, self._outer = (
+            self.lumen_outline.at(self.lumen_at),
+            self.outer_outline.at(self.outer_at),
+        )
         c = self.lumen_at
-        self._planes = np.stack([np.ones(len(flat)), c.rho * np.cos(c.theta), c.rho * np.sin(c.theta)], 1)
+        self._planes = np.stack(
+            [np.ones(len(flat)), c.rho * np.cos(c.theta), c.rho * np.sin(c.theta)], 1
+        )
         self.gram = LocalGram.of(data.gram, self.index, data.scale)
         ones = data.apply(torch.ones(grid.shape)).double()
         self.ones = ones.numpy()[tuple(self.index.T)]
@@ -237,14 +269,15 @@ class Vessel:
         self.b_sum = float(data.b.double().sum())
         self._radius = float(np.median(start.radii[1][1]))
         self._prior_mean, self._prior = self._prior_of()
-        # Beyond the rim of the volume it goes on as it ends, elsewhere there is fat beside the vessel's voxels.
+        # Beyond the rim of the volume it goes on as it ends, elsewhere there is fat beside the
+        # vessel's voxels.
         beside = np.pad(self.lookup, 1, mode="edge")
         steps = np.concatenate([np.eye(3, dtype=int), -np.eye(3, dtype=int)])
         self.neighbours = np.stack([beside[tuple((self.index + 1 + step).T)] for step in steps], 1)
 
     body_precision = _BODY_SD**-2.0
 
-    # -- parameters ----------------------------------------------------------------------------------------------
+    # -- parameters --------------------------------------------------------------------------------
 
     @property
     def size(self) -> int:
@@ -295,10 +328,11 @@ class Vessel:
         guess[self.outer_part] = self.outer_outline.constant(r2, at2).ravel()
         return guess
 
-    # -- drawing -------------------------------------------------------------------------------------------------
+    # -- drawing -----------------------------------------------------------------------------------
 
     def as_projected(self, soft: Any) -> Any:
-        """What the operator must be given of ``(n,)`` or ``(n, k)`` values that are drawn as softly as outlines."""
+        """What the operator must be given of ``(n,)`` or ``(n, k)`` values that are drawn as
+        softly as outlines."""
         return self._less(soft, EXCESS)
 
     def voxel_means(self, soft: Floats) -> Floats:
@@ -321,16 +355,22 @@ class Vessel:
         """Variance in mm² that the edges' blur adds to that of an outline, in the plane."""
         return math.exp(parameters[BLUR]) - _LEFT * self.grid.spacing[1] * self.grid.spacing[2]
 
-    def _distance(self, at: OutlineAt, c: Coordinates, shape: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Signed distance, unit normal, change of the distance per change of the radius, and half the curvature."""
+    def _distance(
+        self, at: OutlineAt, c: Coordinates, shape: Floats
+    ) -> tuple[Floats, Floats, Floats, Floats]:
+        """Signed distance, unit normal, change of the distance per change of the radius, and
+        half the curvature."""
         r, turn, slope = at.radius(shape)
         around = turn / np.maximum(c.rho, 0.3 * np.abs(r) + 0.05)
         length = np.sqrt(1 + around**2 + slope**2)
-        normal = (c.frame[:, 0] - around[:, None] * c.frame[:, 1] - slope[:, None] * c.frame[:, 2]) / length[:, None]
+        normal = (
+            c.frame[:, 0] - around[:, None] * c.frame[:, 1] - slope[:, None] * c.frame[:, 2]
+        ) / length[:, None]
         return (c.rho - r) / length, normal, 1.0 / length, 0.5 / np.maximum(np.abs(r), 0.2)
 
     def draw(self, parameters: Floats, bodies: Floats, *, jacobian: bool = True) -> Drawing:
-        """The vessel with parameters ``(p,)`` and bodies ``(k, n)``, shares of the fibrous layer."""
+        """The vessel with parameters ``(p,)`` and bodies ``(k, n)``, shares of the fibrous
+        layer."""
         fat, wall, fibrous, blood = parameters[:4]
         thickness, blur = math.exp(parameters[THICKNESS]), math.exp(parameters[BLUR])
         softer_by = self.softer_by(parameters)
@@ -344,8 +384,10 @@ class Vessel:
         )
         share, slope, softer = np.empty((3, n)), np.empty((3, n)), np.empty((3, n))
         outlines = (
-            (outer_d, outer_n, outer_bend), (outer_d + thickness, outer_n, outer_bend), (lumen_d, lumen_n, lumen_bend),
-        )  # fmt: skip
+            (outer_d, outer_n, outer_bend),
+            (outer_d + thickness, outer_n, outer_bend),
+            (lumen_d, lumen_n, lumen_bend),
+        )
         for k, (d, normal, bend) in enumerate(outlines):
             # Focal spot and gantry blur in the plane, not along z.
             flat = 1.0 - normal[:, 0] ** 2
@@ -376,17 +418,32 @@ class Vessel:
             single[:, LUMEN] = shares[2]
             single[:, THICKNESS] = -inside * steps[1] * slope[1] * thickness
             single[:, BLUR] = inside * (steps * softer).sum(0)
-            single[:, ENDS : ENDS + 3] = (-whole * end_slope[0] * end_share[1])[:, None] * self._planes
-            single[:, ENDS + 3 : ENDS + 6] = (whole * end_slope[1] * end_share[0])[:, None] * self._planes
-            self._lumen.spread(inside * steps[2] * slope[2] * lumen_rate, single[:, self.lumen_part])
+            single[:, ENDS : ENDS + 3] = (-whole * end_slope[0] * end_share[1])[
+                :, None
+            ] * self._planes
+            single[:, ENDS + 3 : ENDS + 6] = (whole * end_slope[1] * end_share[0])[
+                :, None
+            ] * self._planes
+            self._lumen.spread(
+                inside * steps[2] * slope[2] * lumen_rate, single[:, self.lumen_part]
+            )
             outward = inside * (steps[0] * slope[0] + steps[1] * slope[1]) * outer_rate
             self._outer.spread(outward, single[:, self.outer_part])
             for k, body in enumerate(bodies):
                 single[:, self.size + k] = body * (shares[1] - shares[2])
             single = self.as_projected(single)
-        return Drawing(soft, shares, self.as_projected(soft), single, lumen_d, outer_d + thickness, lumen_sd, lumen_n)
+        return Drawing(
+            soft,
+            shares,
+            self.as_projected(soft),
+            single,
+            lumen_d,
+            outer_d + thickness,
+            lumen_sd,
+            lumen_n,
+        )
 
-    # -- fitting -------------------------------------------------------------------------------------------------
+    # -- fitting -----------------------------------------------------------------------------------
 
     def _prior_with(self, k: int, expected: bool) -> Floats:
         """``(p, p)`` precision with ``k`` bodies."""
@@ -395,10 +452,15 @@ class Vessel:
         sd = np.array([self.prior.wall[1], self.prior.fibrous[1]])
         if expected:
             sd = np.minimum(_EXPECTED_SD, sd)
-            for part, outline in ((self.lumen_part, self.lumen_outline), (self.outer_part, self.outer_outline)):
+            for part, outline in (
+                (self.lumen_part, self.lumen_outline),
+                (self.outer_part, self.outer_outline),
+            ):
                 rounder = outline.precision(self._radius, self.prior.freedom, least_order=3)
                 precision[part, part] += (_EXPECTED_ROUND**2 - 1) * rounder
-        precision[WALL : FIBROUS + 1, WALL : FIBROUS + 1] = np.linalg.inv(np.diag(sd**2) + self.prior.shift**2)
+        precision[WALL : FIBROUS + 1, WALL : FIBROUS + 1] = np.linalg.inv(
+            np.diag(sd**2) + self.prior.shift**2
+        )
         precision[range(self.size, self.size + k), range(self.size, self.size + k)] = _BODY_SD**-2.0
         return precision
 
@@ -409,7 +471,8 @@ class Vessel:
         return off
 
     def energy(self, parameters: Floats, v: Floats, precision: Floats) -> tuple[float, Floats]:
-        """½ xᵀGx − bᵀx − log prior without constants, and G times the image above fat on the voxels, ``(n,)``.
+        """½ xᵀGx − bᵀx − log prior without constants, and G times the image above fat on the
+        voxels, ``(n,)``.
 
         Args:
             parameters: ``(p,)``.
@@ -418,7 +481,13 @@ class Vessel:
         """
         f = parameters[FAT]
         curved = self.gram.apply(v.astype(np.float32)[:, None])[:, 0].astype(np.float64)
-        data = 0.5 * f * f * self.ones_energy + f * (self.ones @ v) + 0.5 * v @ curved - f * self.b_sum - self.b @ v
+        data = (
+            0.5 * f * f * self.ones_energy
+            + f * (self.ones @ v)
+            + 0.5 * v @ curved
+            - f * self.b_sum
+            - self.b @ v
+        )
         off = self._off(parameters)
         return float(data + 0.5 * off @ precision @ off), curved
 
@@ -431,17 +500,18 @@ class Vessel:
         steps: int = 20,
         tolerance: float = 0.03,
     ) -> Fit:
-        """Gauss and Newton's steps, shortened or damped where they lead up, from given parameters to the mode.
+        """Gauss and Newton's steps, shortened or damped where they lead up, from given parameters
+        to the mode.
 
         Args:
             parameters: where to begin, ``(size + k,)``.
             bodies: shares of the fibrous layer, ``(k, n)``.
-            expected: wall and fibrous tissue hardly leave their prior's mean, the outlines hardly an ellipse. A core
-                that the model does not have yet would otherwise pull the fibrous value to its own, and make wall of
-                the fibrous tissue.
+            expected: wall and fibrous tissue hardly leave their prior's mean, the outlines hardly
+                an ellipse. A core that the model does not have yet would otherwise pull the fibrous
+                value to its own, and make wall of the fibrous tissue.
             steps: largest number of them.
-            tolerance: stop where the next step would gain less than this of the log posterior by its linear model: a
-                shortened step may gain as little far from the mode.
+            tolerance: stop where the next step would gain less than this of the log posterior by
+                its linear model: a shortened step may gain as little far from the mode.
         """
         bodies = np.zeros((0, len(self.index))) if bodies is None else bodies
         precision = self._prior_with(len(bodies), expected)
@@ -452,7 +522,9 @@ class Vessel:
         damping = 0.0
         for _ in range(steps):
             gradient = self._gradient(theta, drawing, curved_image, precision)
-            step = cho_solve(cho_factor(hessian + damping * np.diag(np.diag(hessian)), lower=True), gradient)
+            step = cho_solve(
+                cho_factor(hessian + damping * np.diag(np.diag(hessian)), lower=True), gradient
+            )
             along, share = float(gradient @ step), 1.0
             if 0.5 * along < tolerance:
                 break
@@ -476,16 +548,22 @@ class Vessel:
         residual = self.b - theta[FAT] * self.ones - curved_image
         return Fit(theta, drawing, energy, residual, gradient, precision, bodies, self)
 
-    def _gradient(self, theta: Floats, drawing: Drawing, curved_image: Floats, precision: Floats) -> Floats:
+    def _gradient(
+        self, theta: Floats, drawing: Drawing, curved_image: Floats, precision: Floats
+    ) -> Floats:
         """Of −energy."""
         assert drawing.jacobian is not None
         residual = self.b - theta[FAT] * self.ones - curved_image
-        gradient: Floats = drawing.jacobian.T @ residual.astype(np.float32) - precision @ self._off(theta)
+        gradient: Floats = drawing.jacobian.T @ residual.astype(np.float32) - precision @ self._off(
+            theta
+        )
         # Fat fills the whole volume, beside what it leaves to the vessel.
         gradient[FAT] += self.b_sum - theta[FAT] * self.ones_energy - self.ones @ drawing.image
         return gradient
 
-    def hessian(self, drawing: Drawing, precision: Floats, seen: NDArray[np.float32] | None = None) -> Floats:
+    def hessian(
+        self, drawing: Drawing, precision: Floats, seen: NDArray[np.float32] | None = None
+    ) -> Floats:
         """Gauss and Newton's, ``(p, p)``, with the prior's.
 
         Args:
@@ -495,7 +573,9 @@ class Vessel:
         """
         jacobian = drawing.jacobian
         assert jacobian is not None
-        hessian = (self.gram.curvature(jacobian) if seen is None else jacobian.T @ seen).astype(np.float64)
+        hessian = (self.gram.curvature(jacobian) if seen is None else jacobian.T @ seen).astype(
+            np.float64
+        )
         # Fat fills the whole volume.
         across = self.ones.astype(np.float32) @ jacobian
         hessian[FAT] += across

@@ -9,31 +9,35 @@ from torchpcct.validate import number, numbers, whole
 __all__ = ["MOST_ORDERS", "VesselPrior"]
 
 MOST_ORDERS = 4
-"""Fourier orders of a section: 1 moves it, 2 makes it an ellipse, 3 an egg; a flat ellipse needs 4."""
+"""Fourier orders of a section: 1 moves it, 2 makes it an ellipse, 3 an egg; a flat ellipse needs
+4."""
 
 
 @dataclass(frozen=True)
 class VesselPrior:
     """Values of wall and fibrous tissue, and how free the outlines are.
 
-    A wall is about one voxel thick, and its value trades with its thickness; values of fibrous tissue and core trade
-    with the core's size and the outlines: a prior as wide as the tissues' own variety keeps them from what no tissue
-    is. Fibrous plaque has 91 ± 21 HU (Schroeder et al. 2001, J. Am. Coll. Cardiol. 37, 1430), unenhanced muscle 50 to
-    60 HU. An enhanced wall wants another value.
+    A wall is about one voxel thick, and its value trades with its thickness; values of fibrous
+    tissue and core trade with the core's size and the outlines: a prior as wide as the tissues' own
+    variety keeps them from what no tissue is. Fibrous plaque has 91 ± 21 HU (Schroeder et al. 2001,
+    J. Am. Coll. Cardiol. 37, 1430), unenhanced muscle 50 to 60 HU. An enhanced wall wants another
+    value.
 
     Args:
         wall: mean and standard deviation, HU.
         fibrous: the same.
-        orders: Fourier orders of lumen and outer outline, 2 to 4: the more, the flatter the ellipses they can be, and
-            the less the data say of what lies between them.
-        shift: standard deviation of what both differ by from their means together, HU; 0: the scanner is calibrated.
-            MBIR draws outlines with 200, so that it does not matter to them where the scanner's zero lies.
-        freedom: how far sections may move and leave a circle, relative to arteries at large of the same size. With 0.4
-            outlines are rounder: less error, and more contrast read where there is no core (``train/size.md``).
+        orders: Fourier orders of lumen and outer outline, 2 to 4: the more, the flatter the
+            ellipses they can be, and the less the data say of what lies between them.
+        shift: standard deviation of what both differ by from their means together, HU; 0: the
+            scanner is calibrated. MBIR draws outlines with 200, so that it does not matter to them
+            where the scanner's zero lies.
+        freedom: how far sections may move and leave a circle, relative to arteries at large of the
+            same size. With 0.4 outlines are rounder: less error, and more contrast read where there
+            is no core (``train/size.md``).
 
     Raises:
-        ValueError: a value that is not finite, a standard deviation or freedom that is not positive, a negative shift,
-            orders out of range.
+        ValueError: a value that is not finite, a standard deviation or freedom that is not
+            positive, a negative shift, orders out of range.
         TypeError: values of the wrong kind.
     """
 

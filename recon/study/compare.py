@@ -1,4 +1,5 @@
-"""What dose MBIR saves at the paper's plaque, beside FBP, PWLS and the best simple filter: the main job.
+"""What dose MBIR saves at the paper's plaque, beside FBP, PWLS and the best simple filter: the main
+job.
 
 One task of the instrument (:mod:`recon.evaluate`): every method on the same noise realisations.
 """
@@ -30,9 +31,11 @@ from torchpcct.viz import Panel, panels
 __all__ = ["SCREEN", "Settings", "dose_chart", "figures", "measure"]
 
 SCREEN = "compare_screen"
-"""Template of what a terminal shows: the answer, the dose factors of every method, and where the rest is."""
+"""Template of what a terminal shows: the answer, the dose factors of every method, and where the
+rest is."""
 
-_LOW_S, _HIGH_S = paper.DOSES["1x"], paper.DOSES["5.7x"]
+_LOW_S = paper.DOSES["1x"]
+_HIGH_S = paper.DOSES["5.7x"]
 
 
 @dataclass(frozen=True)
@@ -48,15 +51,25 @@ class Settings(StudySettings):
     """
 
     methods: tuple[str, ...] = (
-        "fbp:soft", "fbp:standard", "fbp:detail", "fbp:bone", "pwls", "bilateral@fbp:detail", "mbir"
-    )  # fmt: skip
+        "fbp:soft",
+        "fbp:standard",
+        "fbp:detail",
+        "fbp:bone",
+        "pwls",
+        "bilateral@fbp:detail",
+        "mbir",
+    )
     n: int = 16
     seed: int = 0
     views: int = paper.FULL_VIEWS["PCCT"]
     exposures_s: tuple[float, ...] = (0.35, 2.0)
 
     # An eighth of the views, 8 realisations, no PWLS: some minutes on two slow cores.
-    QUICK: ClassVar[Mapping[str, Any]] = {"views": 246, "n": 8, "methods": ("fbp:soft", "bilateral@fbp:detail", "mbir")}
+    QUICK: ClassVar[Mapping[str, Any]] = {
+        "views": 246,
+        "n": 8,
+        "methods": ("fbp:soft", "bilateral@fbp:detail", "mbir"),
+    }
 
     def __post_init__(self) -> None:
         self.check_whole(n=8, seed=0, views=8)
@@ -65,25 +78,40 @@ class Settings(StudySettings):
             raise ValueError("methods must name at least one method")
 
 
-def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
+def measure(
+    settings: Settings, progress: Progress = silent, folder: str | Path | None = None
+) -> Measured:
     """Simulate, reconstruct, measure; see :mod:`recon.study.study`."""
     s = settings
     task = replace(read_task("plaque"), scanner=presets.pcct(views=s.views))
     kept = Pieces(folder, settings).folder("evaluate")
-    found = evaluate(task, s.methods, exposures_s=s.exposures_s, n=s.n, seed=s.seed, folder=kept, progress=progress)
+    found = evaluate(
+        task,
+        s.methods,
+        exposures_s=s.exposures_s,
+        n=s.n,
+        seed=s.seed,
+        folder=kept,
+        progress=progress,
+    )
     records = plain(found.records)
     data = {
-        "claim": claim(records), "records": records, "reference": task.reference,
-        "tables": "\n\n".join(task_sections(found)), "peak_memory_gib": _peak_memory_gib(),
-    }  # fmt: skip
+        "claim": claim(records),
+        "records": records,
+        "reference": task.reference,
+        "tables": "\n\n".join(task_sections(found)),
+        "peak_memory_gib": _peak_memory_gib(),
+    }
     return Measured(s, data, found)
 
 
 def claim(records: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """The paper's claim made testable, from records of an evaluation: MBIR at 0.35 s has the CNR of FBP at 2 s.
+    """The paper's claim made testable, from records of an evaluation: MBIR at 0.35 s has the CNR of
+    FBP at 2 s.
 
     Returns:
-        Both CNRs, the dose factor at 0.35 s, the one that is needed, and whether it is as large: ``"yes"`` or ``"no"``
+        Both CNRs, the dose factor at 0.35 s, the one that is needed, and whether it is as large:
+            ``"yes"`` or ``"no"``
         where the whole interval is, else ``"open"``; None where one of the two was not measured.
     """
 
@@ -98,17 +126,27 @@ def claim(records: list[dict[str, Any]]) -> dict[str, Any] | None:
     needed = _HIGH_S / _LOW_S
     low, high = (factor["value"] if factor[end] is None else factor[end] for end in ("low", "high"))
     met = "yes" if low >= needed else "no" if high < needed else "open"
-    return {"mbir_s": _LOW_S, "fbp_s": _HIGH_S, "needed": needed, "mbir": ours, "fbp": fbp, "factor": factor,
-            "met": met}  # fmt: skip
+    return {
+        "mbir_s": _LOW_S,
+        "fbp_s": _HIGH_S,
+        "needed": needed,
+        "mbir": ours,
+        "fbp": fbp,
+        "factor": factor,
+        "met": met,
+    }
 
 
 def figures(measured: Measured) -> dict[str, Any]:
-    """Axial and sagittal sections of one realisation at the largest exposure, the truth first, and without noise."""
+    """Axial and sagittal sections of one realisation at the largest exposure, the truth first,
+    and without noise."""
     evaluation: Evaluation = measured.seen
     seen = evaluation.results[0]
     grid, dose = seen.task.grid, max(measured.settings.exposures_s)
     image = axial_grid(grid.center)
-    section = VolumeGrid((int(8.75 / image.spacing[1]), 1, image.shape[2]), image.spacing[1], image.center)
+    section = VolumeGrid(
+        (int(8.75 / image.spacing[1]), 1, image.shape[2]), image.spacing[1], image.center
+    )
     columns: list[tuple[str, Any]] = [("truth", seen.truth)]
     for name in measured.settings.methods:
         columns.append((name.replace("@", "\n@ "), seen.volumes[name, dose][0]))
@@ -123,7 +161,10 @@ def figures(measured: Measured) -> dict[str, Any]:
         f"Plaque, deep-silicon PCCT, {dose:g} s, one realisation",
         f"C150 / W600 HU, voxels of {grid.spacing[0]:.2f} mm.",
     )
-    return {"compare.png": figure, "dose_factors.png": dose_chart(measured.data["records"], measured.settings)}
+    return {
+        "compare.png": figure,
+        "dose_factors.png": dose_chart(measured.data["records"], measured.settings),
+    }
 
 
 _QUESTIONS = (
@@ -136,7 +177,8 @@ _BEYOND = 1000.0
 
 
 def dose_chart(records: list[dict[str, Any]], settings: Settings) -> Any:
-    """Dose factors with their intervals by question, a colour for each exposure; 1 and what the paper assumes marked.
+    """Dose factors with their intervals by question, a colour for each exposure; 1 and what the
+    paper assumes marked.
 
     Args:
         records: of an evaluation.
@@ -150,7 +192,9 @@ def dose_chart(records: list[dict[str, Any]], settings: Settings) -> Any:
     panels: Any = figure.subplots(1, len(_QUESTIONS), sharey=True, squeeze=False)[0]
     for axes, (title, name, where) in zip(panels, _QUESTIONS, strict=True):
         axes.axvline(1.0, color="0.4", linewidth=1.0)
-        axes.axvline(paper.DOSES["5.7x"] / paper.DOSES["1x"], color="tab:red", linewidth=1.0, linestyle=":")
+        axes.axvline(
+            paper.DOSES["5.7x"] / paper.DOSES["1x"], color="tab:red", linewidth=1.0, linestyle=":"
+        )
         for k, exposure in enumerate(exposures):
             place = 0.3 * (k - (len(exposures) - 1) / 2)
             for row, method in enumerate(methods):
@@ -158,8 +202,10 @@ def dose_chart(records: list[dict[str, Any]], settings: Settings) -> Any:
                 found = next((r for r in records if wanted.items() <= r.items()), None)
                 if found is None or not found["value"] > 0.0:
                     continue
-                ends = [found[end] if found[end] is not None and found[end] > 0 else found["value"]
-                        for end in ("low", "high")]  # fmt: skip
+                ends = [
+                    found[end] if found[end] is not None and found[end] > 0 else found["value"]
+                    for end in ("low", "high")
+                ]
                 low, high = np.clip(ends, 1.0 / _BEYOND, _BEYOND)
                 axes.plot([low, high], [row + place] * 2, color=f"C{k}", linewidth=2.0, alpha=0.6)
                 axes.plot(found["value"], row + place, "o", color=f"C{k}", markersize=4.0)

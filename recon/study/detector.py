@@ -1,7 +1,8 @@
 """The silicon detector: counts, efficiency beside the published one, pile-up and charge sharing.
 
-Efficiency is found by following photons through silicon and foils: repeated counts, against threshold and energy. What
-pile-up and charge sharing cost is computed at the detector's rates in counts, energies, CT numbers and noise.
+Efficiency is found by following photons through silicon and foils: repeated counts, against
+threshold and energy. What pile-up and charge sharing cost is computed at the detector's rates in
+counts, energies, CT numbers and noise.
 """
 
 from __future__ import annotations
@@ -31,9 +32,10 @@ Floats = NDArray[np.float64]
 
 PUBLISHED_DQE = 0.68
 PUBLISHED_SLOPE = 0.017
-"""Density-imaging performance at a lowest threshold of 0 keV relative to an ideal detector, and its fall per keV, of an
-edge-on silicon detector: Grönberg, Yin, Maltz, Pelc and Persson, "The effects of intra-detector Compton scatter on
-zero-frequency DQE for photon-counting CT using edge-on-irradiated silicon detectors", arXiv 2206.04164 (2022)."""
+"""Density-imaging performance at a lowest threshold of 0 keV relative to an ideal detector, and its
+fall per keV, of an edge-on silicon detector: Grönberg, Yin, Maltz, Pelc and Persson, "The effects
+of intra-detector Compton scatter on zero-frequency DQE for photon-counting CT using
+edge-on-irradiated silicon detectors", arXiv 2206.04164 (2022)."""
 
 THRESHOLDS_KEV = (0.0, 2.5, 5.0, 7.5, 10.0, 15.0)
 ENERGIES_KEV = (20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 100.0, 120.0)
@@ -68,7 +70,9 @@ class Settings(StudySettings):
         numbers("charge_sharing", self.charge_sharing, positive=True, high=1.0)
 
 
-def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
+def measure(
+    settings: Settings, progress: Progress = silent, folder: str | Path | None = None
+) -> Measured:
     """Follow photons and compute rates, in resumable pieces."""
     s, rng = settings, np.random.default_rng(settings.seed)
     pieces = Pieces(folder, settings)
@@ -84,7 +88,9 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         efficiency.append(followed(f"case_{i}", partial(efficiencies, case, s.photons, rng)))
         progress("photons followed, thresholds", (i + 1) / len(looked_at))
     for i, energy in enumerate(ENERGIES_KEV):
-        spectrum.append(followed(f"energy_{i}", partial(at_energy, energy, max(1000, s.photons // 4), rng)))
+        spectrum.append(
+            followed(f"energy_{i}", partial(at_energy, energy, max(1000, s.photons // 4), rng))
+        )
         progress("photons followed, energies", (i + 1) / len(ENERGIES_KEV))
     pieces.ahead(_pile_up, *((t,) for t in s.dead_times_ns))
     data = {
@@ -93,7 +99,8 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         "efficiency_by_energy": spectrum,
         "repeated_counts_hu": repeated_counts_hu(spectrum),
         "charge_sharing": [
-            followed(f"sharing_{c:g}", partial(charge_sharing, c, s.photons, rng)) for c in s.charge_sharing
+            followed(f"sharing_{c:g}", partial(charge_sharing, c, s.photons, rng))
+            for c in s.charge_sharing
         ],
         "pile_up": [_pile_up(s, pieces, t) for t in s.dead_times_ns],
     }
@@ -105,7 +112,7 @@ def _pile_up(settings: Settings, pieces: Pieces, dead_time_ns: float) -> Any:
     return pieces(f"pile_up_{dead_time_ns:g}", partial(pile_up, dead_time_ns))
 
 
-# --- efficiency -----------------------------------------------------------------------------------------------------
+# --- efficiency -----------------------------------------------------------------------------------
 
 
 class Case(NamedTuple):
@@ -119,8 +126,12 @@ class Case(NamedTuple):
 
 
 def cases() -> list[Case]:
-    """The detectors and beams that are compared, from this package's defaults to the published figure's."""
-    standard, hard = beam_behind(presets.pcct()), beam_behind(presets.pcct(kvp=120.0), "water", 300.0)
+    """The detectors and beams that are compared, from this package's defaults to the published
+    figure's."""
+    standard, hard = (
+        beam_behind(presets.pcct()),
+        beam_behind(presets.pcct(kvp=120.0), "water", 300.0),
+    )
     deep, short = SiliconDetector(), SiliconDetector(length_mm=30.0)
     return [
         Case("60 mm, 100 kVp, 24 cm fat", deep, Stack(), *standard),
@@ -133,7 +144,8 @@ def cases() -> list[Case]:
 
 
 def efficiencies(case: Case, photons: int, rng: np.random.Generator) -> dict[str, Any]:
-    """One-interaction share, and DQE of counts by following photons, against the lowest threshold."""
+    """One-interaction share, and DQE of counts by following photons, against the lowest
+    threshold."""
     d = replace(case.detector, fill_factor=1.0 - case.stack.foil_mm / case.stack.sheet_pitch_mm)
     single = d.above(case.energies, THRESHOLDS_KEV) @ case.photons / case.photons.sum()
     deposits = follow(d, case.energies, case.photons, photons, rng, case.stack)
@@ -176,26 +188,37 @@ def at_energy(energy: float, photons: int, rng: np.random.Generator) -> dict[str
 
 
 def repeated_counts_hu(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """Shifts of the plaque's CT numbers by the weight that repeated counts, see :func:`at_energy`, give to energies."""
+    """Shifts of the plaque's CT numbers by the weight that repeated counts, see
+    :func:`at_energy`, give to energies."""
     energies, beam = beam_behind(presets.pcct())
     weight = SiliconDetector().response(energies)[0] * beam
     ratio = [r["counts_per_photon"] / r["one_interaction"] for r in rows]
-    return hu_shift(energies, weight, weight * np.interp(energies, [r["energy_kev"] for r in rows], ratio))
+    return hu_shift(
+        energies, weight, weight * np.interp(energies, [r["energy_kev"] for r in rows], ratio)
+    )
 
 
-# --- rates ----------------------------------------------------------------------------------------------------------
+# --- rates ----------------------------------------------------------------------------------------
 
 
-def beam_behind(scanner: Scanner, name: str = "pericoronary_fat", path_mm: float = FAT_MM) -> tuple[Floats, Floats]:
+def beam_behind(
+    scanner: Scanner, name: str = "pericoronary_fat", path_mm: float = FAT_MM
+) -> tuple[Floats, Floats]:
     """Energies and photons per mAs that reach the central cell behind a slab."""
     energies, quanta = scanner.quanta()
     centre = scanner.geometry.columns // 2
-    return energies, np.asarray(quanta[centre] * np.exp(-material(name).attenuation(energies) * path_mm))
+    return energies, np.asarray(
+        quanta[centre] * np.exp(-material(name).attenuation(energies) * path_mm)
+    )
 
 
 def hu_shift(energies: Floats, before: Floats, after: Floats) -> dict[str, float]:
-    """How far the CT numbers of the plaque's materials move between two weightings of the energies."""
-    return {n: material(n).hu(energies, after) - material(n).hu(energies, before) for n in PLAQUE_MATERIALS}
+    """How far the CT numbers of the plaque's materials move between two weightings of the
+    energies."""
+    return {
+        n: material(n).hu(energies, after) - material(n).hu(energies, before)
+        for n in PLAQUE_MATERIALS
+    }
 
 
 def counts() -> list[dict[str, Any]]:
@@ -219,14 +242,15 @@ def counts() -> list[dict[str, Any]]:
 
 
 def _mean_energy(thresholds: Any, binned: Any) -> float:
-    """Mean energy of the bins (their middle; the open one by the width of its neighbour), weighted by counts."""
+    """Mean energy of the bins (their middle; the open one by the width of its neighbour),
+    weighted by counts."""
     edges = np.append(thresholds, 2 * thresholds[-1] - thresholds[-2])
     return float((edges[:-1] + edges[1:]) @ binned / 2 / binned.sum())
 
 
 def charge_sharing(share: float, photons: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Counts (both parts may count), photons (or none), energies, CT numbers and efficiency if pulses split between two
-    strips."""
+    """Counts (both parts may count), photons (or none), energies, CT numbers and efficiency if
+    pulses split between two strips."""
     energies, beam = beam_behind(presets.pcct())
     pure, split = SiliconDetector("spectral"), SiliconDetector("spectral", charge_sharing=share)
     before, after = pure.response(energies) @ beam, split.response(energies) @ beam
@@ -234,7 +258,10 @@ def charge_sharing(share: float, photons: int, rng: np.random.Generator) -> dict
     seen = [float(d.photons_above(energies, lowest)[0] @ beam) for d in (pure, split)]
     deposits = follow(SiliconDetector(), energies, beam, photons, rng)
     thresholds, sigma = pure.thresholds_kev, pure.sigma_kev
-    dqe = [efficiency(deposits.counts(thresholds[0], sigma, rng, charge_sharing=c))[0] for c in (0.0, share)]
+    dqe = [
+        efficiency(deposits.counts(thresholds[0], sigma, rng, charge_sharing=c))[0]
+        for c in (0.0, share)
+    ]
     return {
         "share": share,
         "counts_percent": 100 * float(after.sum() / before.sum() - 1),
@@ -242,7 +269,9 @@ def charge_sharing(share: float, photons: int, rng: np.random.Generator) -> dict
         "bins": (after / after.sum()).tolist(),
         "bins_without": (before / before.sum()).tolist(),
         "energy_shift_kev": _mean_energy(thresholds, after) - _mean_energy(thresholds, before),
-        "hu_shift": hu_shift(energies, pure.response(energies).sum(0) * beam, split.response(energies).sum(0) * beam),
+        "hu_shift": hu_shift(
+            energies, pure.response(energies).sum(0) * beam, split.response(energies).sum(0) * beam
+        ),
         "dqe_without": dqe[0],
         "dqe": dqe[1],
         "dqe_percent": 100 * float(dqe[1] / dqe[0] - 1),
@@ -253,7 +282,10 @@ def pile_up(dead_ns: float) -> dict[str, Any]:
     """Losses, spectra and CT numbers with a dead time, in air and behind the body."""
     result: dict[str, Any] = {"dead_time_ns": dead_ns, "merge_ns": dead_ns / 2}
     spectral = SiliconDetector("spectral", dead_time_ns=dead_ns, merge_ns=dead_ns / 2)
-    free, scanner = presets.pcct(), presets.pcct(detector=SiliconDetector(dead_time_ns=dead_ns, merge_ns=dead_ns / 2))
+    free, scanner = (
+        presets.pcct(),
+        presets.pcct(detector=SiliconDetector(dead_time_ns=dead_ns, merge_ns=dead_ns / 2)),
+    )
     current = scanner.source.current_ma
     for key, path in (("air", 0.0), ("body", FAT_MM)):
         energies, beam = beam_behind(scanner, path_mm=path)
@@ -266,8 +298,8 @@ def pile_up(dead_ns: float) -> dict[str, Any]:
             "energy_shift_kev": _mean_energy(thresholds, recorded) - _mean_energy(thresholds, true),
             "top_bin_percent": [100 * float(v[-1] / v.sum()) for v in (true, recorded)],
         }
-    # Line integrals of the central ray: air and body as recorded, with the correction of the ideal detector and with
-    # one that was calibrated in water with pile-up on.
+    # Line integrals of the central ray: air and body as recorded, with the correction of the ideal
+    # detector and with one that was calibrated in water with pile-up on.
     body, reference = _lines(free, free), free.water_linearisation().mu_ref
     for name, corrected in (("uncorrected", free), ("calibrated", scanner)):
         lines, mu = _lines(scanner, corrected), corrected.water_linearisation().mu_ref
@@ -279,7 +311,8 @@ def pile_up(dead_ns: float) -> dict[str, Any]:
 
 
 def _lines(scanner: Scanner, corrected: Scanner) -> Floats:
-    """Corrected line integrals of the central ray: 24 cm of fat, and with 3.36 mm of it replaced by blood."""
+    """Corrected line integrals of the central ray: 24 cm of fat, and with 3.36 mm of it replaced
+    by blood."""
     energies, air = beam_behind(scanner, path_mm=0.0)
     fat, blood = (material(n).attenuation(energies) for n in ("pericoronary_fat", "blood_iodine"))
     depths = np.array([0 * fat, fat * FAT_MM, fat * (FAT_MM - INSET_MM) + blood * INSET_MM])
@@ -291,44 +324,79 @@ def _lines(scanner: Scanner, corrected: Scanner) -> Floats:
     return linearisation.apply(spread).numpy()[:, columns // 2]
 
 
-# --- the report -----------------------------------------------------------------------------------------------------
+# --- the report -----------------------------------------------------------------------------------
 
 
 def checks(data: dict[str, Any]) -> list[Check]:
-    """Counts beside CatSim's beam, efficiency beside the published one, and that pile-up behind the body is small."""
+    """Counts beside CatSim's beam, efficiency beside the published one, and that pile-up behind
+    the body is small."""
     air, body = data["counts"]
-    first, last = ({r["threshold_kev"]: r["density"] for r in data["efficiency"][k]["rows"]} for k in (0, -1))
+    first, last = (
+        {r["threshold_kev"]: r["density"] for r in data["efficiency"][k]["rows"]} for k in (0, -1)
+    )
     middle = next(r for r in data["pile_up"] if r["dead_time_ns"] >= 50 or r is data["pile_up"][-1])
     note = "60 mm; 30 mm, 120 kVp: next row. Repeated counts, length and beam, see the table"
     incident = "incident photons per cell and view"
     return [
-        Check(f"{incident}, air", air["incident_per_view"], "16070 (CatSim beam)", 15749.0, 16391.0),
-        Check(f"{incident}, 24 cm fat", body["incident_per_view"], "161 (CatSim beam)", 157.8, 164.2),
-        Check("counted / incident behind 24 cm fat", body["share"], "0.71 (CatSim beam)", 0.70, 0.72),
+        Check(
+            f"{incident}, air", air["incident_per_view"], "16070 (CatSim beam)", 15749.0, 16391.0
+        ),
+        Check(
+            f"{incident}, 24 cm fat", body["incident_per_view"], "161 (CatSim beam)", 157.8, 164.2
+        ),
+        Check(
+            "counted / incident behind 24 cm fat", body["share"], "0.71 (CatSim beam)", 0.70, 0.72
+        ),
         Check("density DQE at 0 keV, 60 mm, 100 kVp", first[0.0], PUBLISHED_DQE, 0.58, 0.78, note),
         Check("density DQE at 0 keV, 30 mm, 120 kVp", last[0.0], PUBLISHED_DQE, 0.63, 0.73),
         Check("its fall per keV up to 10 keV", (last[0.0] - last[10.0]) / 10, 0.017, 0.012, 0.022),
-        Check("pile-up behind the body, calibrated, HU", middle["calibrated_body_hu"], "negligible", -1.0, 1.0),
+        Check(
+            "pile-up behind the body, calibrated, HU",
+            middle["calibrated_body_hu"],
+            "negligible",
+            -1.0,
+            1.0,
+        ),
     ]
 
 
 def figures(measured: Measured) -> dict[str, Any]:
-    """Efficiency against threshold and energy, and recorded over true counts against the thickness of fat."""
+    """Efficiency against threshold and energy, and recorded over true counts against the
+    thickness of fat."""
     from matplotlib.figure import Figure
 
     parts = measured.data
     figure = Figure(figsize=(11.5, 3.8), dpi=150, layout="constrained")
     threshold, energy, loss = figure.subplots(1, 3)
-    shown = {0: ("black", "60 mm, 100 kVp"), 3: ("tab:blue", "30 mm, 100 kVp"), 5: ("tab:green", "30 mm, 120 kVp")}
+    shown = {
+        0: ("black", "60 mm, 100 kVp"),
+        3: ("tab:blue", "30 mm, 100 kVp"),
+        5: ("tab:green", "30 mm, 120 kVp"),
+    }
     for index, (colour, label) in shown.items():
         rows = parts["efficiency"][index]["rows"]
         x = [r["threshold_kev"] for r in rows]
-        threshold.plot(x, [r["density"] for r in rows], "o-", color=colour, markersize=3, label=f"{label}, followed")
+        threshold.plot(
+            x,
+            [r["density"] for r in rows],
+            "o-",
+            color=colour,
+            markersize=3,
+            label=f"{label}, followed",
+        )
         if index == 0:
-            threshold.plot(x, [r["one_interaction"] for r in rows], ":", color=colour, label=f"{label}, counted once")
+            threshold.plot(
+                x,
+                [r["one_interaction"] for r in rows],
+                ":",
+                color=colour,
+                label=f"{label}, counted once",
+            )
     published = [r["published"] for r in rows if r["threshold_kev"] <= 10]
     threshold.plot(x[: len(published)], published, "--", color="tab:red", label="published")
-    threshold.set(xlabel="lowest threshold, keV", ylabel="DQE(0)", ylim=(0, 1), title="against the threshold")
+    threshold.set(
+        xlabel="lowest threshold, keV", ylabel="DQE(0)", ylim=(0, 1), title="against the threshold"
+    )
     rows = parts["efficiency_by_energy"]
     x, dqe, error = ([r[k] for r in rows] for k in ("energy_kev", "dqe", "dqe_error"))
     energy.plot(x, [r["one_interaction"] for r in rows], ":", color="black", label="counted once")
@@ -338,12 +406,21 @@ def figures(measured: Measured) -> dict[str, Any]:
     energy.set(xlabel="photon energy, keV", ylim=(0, 1), title="against energy (5 keV, 60 mm)")
     scanner, path = presets.pcct(), np.linspace(0.0, 240.0, 49)
     energies = scanner.quanta()[0]
-    arriving = scanner.source.current_ma * np.stack([beam_behind(scanner, path_mm=t)[1] for t in path])
+    arriving = scanner.source.current_ma * np.stack(
+        [beam_behind(scanner, path_mm=t)[1] for t in path]
+    )
     for entry in parts["pile_up"]:
         detector = SiliconDetector(dead_time_ns=entry["dead_time_ns"])
-        ratio = recorded_rates(detector, energies, arriving)[0] / (arriving @ detector.response(energies)[0])
+        ratio = recorded_rates(detector, energies, arriving)[0] / (
+            arriving @ detector.response(energies)[0]
+        )
         loss.plot(path, ratio, label=f"{entry['dead_time_ns']:.0f} ns")
-    loss.set(xlabel="fat, mm", ylabel="recorded / true counts", ylim=(0, 1.02), title="pile-up, central ray, 1000 mA")
+    loss.set(
+        xlabel="fat, mm",
+        ylabel="recorded / true counts",
+        ylim=(0, 1.02),
+        title="pile-up, central ray, 1000 mA",
+    )
     for ax in (threshold, energy, loss):
         ax.legend(fontsize=7)
         ax.title.set_fontsize(10)

@@ -1,4 +1,5 @@
-"""What the figures of several studies draw alike: the plaque's axial image, its extent, its outlines."""
+"""What the figures of several studies draw alike: the plaque's axial image, its extent, its
+outlines."""
 
 from __future__ import annotations
 
@@ -14,17 +15,22 @@ from torchpcct.viz import Panel
 __all__ = ["curve_axes", "extent", "middle_panel", "plaque_panel", "roi_outlines"]
 
 _SHOWN_PX = 160
-"""Edge of the middle of an image of the protocol's pixels that shows the vessel and its surroundings."""
+"""Edge of the middle of an image of the protocol's pixels that shows the vessel and its
+surroundings."""
 
 
-def extent(grid: VolumeGrid, vertical: int = -2, horizontal: int = -1) -> tuple[float, float, float, float]:
-    """Edges (left, right, bottom, top) in mm of an image along two axes of ``grid``, about its centre."""
+def extent(
+    grid: VolumeGrid, vertical: int = -2, horizontal: int = -1
+) -> tuple[float, float, float, float]:
+    """Edges (left, right, bottom, top) in mm of an image along two axes of ``grid``, about its
+    centre."""
     h, v = grid.extent[horizontal] / 2, grid.extent[vertical] / 2
     return (-h, h, -v, v)
 
 
 def roi_outlines(rois: RoiPair) -> tuple[tuple[Any, str], ...]:
-    """Outlines of the two ROIs of the CNR for a panel: the core's blue, the fibrous tissue's red."""
+    """Outlines of the two ROIs of the CNR for a panel: the core's blue, the fibrous tissue's
+    red."""
     return (rois.foreground[0], "deepskyblue"), (rois.background[0], "tomato")
 
 
@@ -34,15 +40,20 @@ def _middle(image: Any) -> Any:
 
 
 def middle_panel(image: Any, title: str = "", **more: Any) -> Panel:
-    """The vessel and its surroundings in an image of the protocol's pixels; ``more``: other fields of the panel."""
+    """The vessel and its surroundings in an image of the protocol's pixels; ``more``: other
+    fields of the panel."""
     half = 0.5 * PROTOCOL_PIXEL_MM * _SHOWN_PX
     return Panel(_middle(image), (-half, half, -half, half), title, **more)
 
 
 def plaque_panel(found: PlaqueImage, title: str = "", caption: str = "") -> Panel:
-    """The middle of a measured axial image with the outlines of its lumen (red) and its core, where found (yellow)."""
+    """The middle of a measured axial image with the outlines of its lumen (red) and its core,
+    where found (yellow)."""
     s = found.segmentation
-    outlines = [(_middle(s.lumen), "tomato"), *([(_middle(s.core), "gold")] if s.core_found else [])]
+    outlines = [
+        (_middle(s.lumen), "tomato"),
+        *([(_middle(s.core), "gold")] if s.core_found else []),
+    ]
     return middle_panel(found.image, title, outlines=outlines, caption=caption)
 
 

@@ -1,11 +1,14 @@
-"""How much residual motion the plaque's image bears, in PCCT and EID-CT, and what motion compensation gets back.
+"""How much residual motion the plaque's image bears, in PCCT and EID-CT, and what motion
+compensation gets back.
 
-Protocol of Li et al., section "Motion Artifacts": the vessel moves rigidly in the axial plane, 2 mm · sin(2π t) (60
-beats a minute), during one turn of 0.35 s; residual motion is 10 to 60 % of that. FBP on 0.2 mm voxels without noise.
-Every view sees the vessel where it is then, and blurred by its way during the view: no phase volumes.
+Protocol of Li et al., section "Motion Artifacts": the vessel moves rigidly in the axial plane, 2 mm
+· sin(2π t) (60 beats a minute), during one turn of 0.35 s; residual motion is 10 to 60 % of that.
+FBP on 0.2 mm voxels without noise. Every view sees the vessel where it is then, and blurred by its
+way during the view: no phase volumes.
 
-Beyond the paper: reconstruction with the motion known (FBP, penalised least squares and the learned MBIR, each with
-the displaced inset in its backprojector or projector), with the motion known wrongly, and with noise.
+Beyond the paper: reconstruction with the motion known (FBP, penalised least squares and the learned
+MBIR, each with the displaced inset in its backprojector or projector), with the motion known
+wrongly, and with noise.
 """
 
 from __future__ import annotations
@@ -57,13 +60,15 @@ _TOLERANCE = 20.0
 """Largest error of a measure in per cent that the paper accepts (its resolution study)."""
 
 _DICE = 0.5
-"""Overlap with the true core from which a segmented region counts as the core: in noise, closed specks do not."""
+"""Overlap with the true core from which a segmented region counts as the core: in noise, closed
+specks do not."""
 
 _PWLS_TOLERANCE_HU = 2.0
 _ERROR_WIDTH_HU = 200.0  # of the window of the error maps, about 0 HU, as in the paper
 
 Key = tuple[str, float | None, bool]
-"""Method, error of the estimated motion (0: the true one; None: the still vessel), whether there is noise."""
+"""Method, error of the estimated motion (0: the true one; None: the still vessel), whether there
+is noise."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +76,8 @@ class Settings(StudySettings):
     """Settings of the motion study.
 
     Args:
-        thinning: simulate one view in so many (1: all); thinned views last as long as one of the complete scan.
+        thinning: simulate one view in so many (1: all); thinned views last as long as one of the
+            complete scan.
         amplitude_mm: of the whole motion.
         rate_bpm: beats per minute.
         rotation_s: time of one turn.
@@ -119,7 +125,9 @@ class Settings(StudySettings):
         if not self.fractions:
             raise ValueError("fractions must hold at least one residual motion")
         if set(self.methods) - set(METHODS) or "fbp" not in self.methods:
-            raise ValueError(f"methods must hold fbp and be of {', '.join(METHODS)}, got {self.methods}")
+            raise ValueError(
+                f"methods must hold fbp and be of {', '.join(METHODS)}, got {self.methods}"
+            )
 
     @property
     def motion(self) -> SinusoidalMotion:
@@ -138,9 +146,10 @@ class Found:
 
     Attributes:
         at_rest: scanner → what the still vessel's image shows; its reference.
-        residual: (scanner, fraction) → the uncompensated image, in place and moved back by the mean displacement.
-        compensated: (method, error of the estimate, noisy) → one entry per realisation; error 0: the true motion;
-            None: the still vessel by the same method.
+        residual: (scanner, fraction) → the uncompensated image, in place and moved back by the mean
+            displacement.
+        compensated: (method, error of the estimate, noisy) → one entry per realisation; error 0:
+            the true motion; None: the still vessel by the same method.
     """
 
     at_rest: dict[str, PlaqueImage] = field(default_factory=dict)
@@ -149,11 +158,16 @@ class Found:
 
     def residuals(self, scanner: str) -> dict[float, tuple[PlaqueImage, PlaqueImage]]:
         """``residual`` of one scanner, by fraction."""
-        return {fraction: pair for (name, fraction), pair in self.residual.items() if name == scanner}
+        return {
+            fraction: pair for (name, fraction), pair in self.residual.items() if name == scanner
+        }
 
 
-def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
-    """Simulate and reconstruct residual motion in both scanners, and compensate the PCCT's, in resumable pieces."""
+def measure(
+    settings: Settings, progress: Progress = silent, folder: str | Path | None = None
+) -> Measured:
+    """Simulate and reconstruct residual motion in both scanners, and compensate the PCCT's, in
+    resumable pieces."""
     s, pieces, m = settings, Pieces(folder, settings), Found()
     scene, plaque = plaque_scene()
     reference = Reference.of(scene, plaque, inset_grid(plaque, s.voxel_mm))
@@ -171,7 +185,9 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
                 "plan": dict(moving.info["plan"]),
             }
             told = partial(progress, "compensation")
-            m.compensated = compensate(s, still, moving, reference, pieces.within("compensation"), told)
+            m.compensated = compensate(
+                s, still, moving, reference, pieces.within("compensation"), told
+            )
     data |= {
         "at_rest": {name: o.measures for name, o in m.at_rest.items()},
         "residual": [
@@ -179,7 +195,12 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
             for (name, f), (here, back) in m.residual.items()
         ],
         "compensated": [
-            {"method": method, "error": error, "noisy": noisy, "realizations": [o.measures for o in found]}
+            {
+                "method": method,
+                "error": error,
+                "noisy": noisy,
+                "realizations": [o.measures for o in found],
+            }
             for (method, error, noisy), found in m.compensated.items()
         ],
     }
@@ -201,7 +222,10 @@ def _residual(
         moving = _scan(s, pieces, name, fraction)
         mean = np.tile(fraction * path.mean(0), (len(path), 1))
         in_place, back = reference_fbp(moving, grid), reference_fbp(moving, grid, mean)
-        m.residual[name, fraction] = (observe(in_place, reference, rest), observe(back, reference, rest))
+        m.residual[name, fraction] = (
+            observe(in_place, reference, rest),
+            observe(back, reference, rest),
+        )
         progress(name, (done + 1) / len(fractions))
     return still, moving
 
@@ -210,18 +234,23 @@ def _scan(s: Settings, pieces: Pieces, name: str, fraction: float) -> Scan:
     scanner = SCANNERS[name](paper.FULL_VIEWS[name] // s.thinning)
     scene, plaque = plaque_scene(motion=s.motion.scaled(fraction))
     run = partial(
-        acquire, scene, scanner, region=inset_grid(plaque, s.voxel_mm), rotation_s=s.rotation_s,
+        acquire,
+        scene,
+        scanner,
+        region=inset_grid(plaque, s.voxel_mm),
+        rotation_s=s.rotation_s,
         duty=duty(scanner, paper.FULL_VIEWS[name]),
-    )  # fmt: skip
+    )
     return pieces.within(name)(f"scan_{fraction:g}", run)
 
 
-# --- what one image yields ------------------------------------------------------------------------------------------
+# --- what one image yields ------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Where things are at rest: the plaque on the protocol's axial image, and its ROIs on the grid of all volumes."""
+    """Where things are at rest: the plaque on the protocol's axial image, and its ROIs on the
+    grid of all volumes."""
 
     grid: VolumeGrid
     truth: Truth
@@ -237,7 +266,8 @@ class Reference:
 def observe(volume: Tensor, reference: Reference, rest: Tensor) -> PlaqueImage:
     """Measure a volume ``(z, y, x)`` HU; ``rest``: the same without motion.
 
-    ``nrmse``: rms difference to it over the rms of its deviation from fat; ``roi_hu``: of core and fibrous tissue.
+    ``nrmse``: rms difference to it over the rms of its deviation from fat; ``roi_hu``: of core and
+    fibrous tissue.
     """
     image = sample_axial(volume.double(), reference.grid, reference.truth.image)[0]
     core, fibrous = (float(r(volume)) for r in reference.rois)
@@ -245,20 +275,28 @@ def observe(volume: Tensor, reference: Reference, rest: Tensor) -> PlaqueImage:
     fat = float(rest.median())
     error = (volume.double() - rest.double()).square().mean().sqrt()
     nrmse = float(error / (rest.double() - fat).square().mean().sqrt())
-    return measure_plaque(image, reference.truth, nrmse=nrmse, roi_hu=(core, fibrous), contrast_hu=fibrous - core)
+    return measure_plaque(
+        image, reference.truth, nrmse=nrmse, roi_hu=(core, fibrous), contrast_hu=fibrous - core
+    )
 
 
-# --- motion known ---------------------------------------------------------------------------------------------------
+# --- motion known ---------------------------------------------------------------------------------
 
 
 def compensate(
-    s: Settings, still: Scan, moving: Scan, reference: Reference, pieces: Pieces, progress: Callable[[float], None]
+    s: Settings,
+    still: Scan,
+    moving: Scan,
+    reference: Reference,
+    pieces: Pieces,
+    progress: Callable[[float], None],
 ) -> dict[Key, list[PlaqueImage]]:
-    """Reconstruct the noise-free scans of the still and of the moving vessel and their noisy realisations.
+    """Reconstruct the noise-free scans of the still and of the moving vessel and their noisy
+    realisations.
 
-    PWLS, whose solution is to be certified by exact projections, is run without noise and for the first noise
-    realisation, at rest and with the true motion; FBP and MBIR with every estimate of the motion. One entry per
-    realisation.
+    PWLS, whose solution is to be certified by exact projections, is run without noise and for the
+    first noise realisation, at rest and with the true motion; FBP and MBIR with every estimate of
+    the motion. One entry per realisation.
     """
     grid = reference.grid
     path = view_motion(s.motion.scaled(s.worst), moving.geometry, s.rotation_s)
@@ -267,7 +305,10 @@ def compensate(
     problems: dict[float | None, InsetProblem] = {}
     if set(s.methods) - {"fbp"}:
         problem = InsetProblem(still, grid)
-        problems = {e: problem if motion is None else problem.with_motion(motion) for e, motion in estimates.items()}
+        problems = {
+            e: problem if motion is None else problem.with_motion(motion)
+            for e, motion in estimates.items()
+        }
     network = Mbir.load() if "mbir" in s.methods else None
 
     def reconstruct(method: str, scan: Scan, error: float | None) -> Tensor:
@@ -276,8 +317,11 @@ def compensate(
         if network is None or method == "pwls":
             found, _ = problems[error].solve([scan], DEFAULT_PRIOR, tolerance=_PWLS_TOLERANCE_HU)
             return found[0].float()
-        # Noise free: as a scan of the study's exposure whose readings happen to be their expectations.
-        b = problems[error].statistic(scan).b * (s.exposure_s / NOISE_FREE_EXPOSURE_S if scan.noise_free else 1.0)
+        # Noise free: as a scan of the study's exposure whose readings happen to be their
+        # expectations.
+        b = problems[error].statistic(scan).b * (
+            s.exposure_s / NOISE_FREE_EXPOSURE_S if scan.noise_free else 1.0
+        )
         return network(problems[error], b[None], s.exposure_s)[0]
 
     noise: list[int | None] = [None, *range(s.seed, s.seed + s.realizations)]
@@ -285,7 +329,10 @@ def compensate(
     rest: dict[str, Tensor] = {}
     for k, seed in enumerate(noise):
         # The same draws at rest and in motion: noise belongs to the reading, not to what is seen.
-        scans = [scan if seed is None else scan.with_noise(s.exposure_s, seed) for scan in (still, moving)]
+        scans = [
+            scan if seed is None else scan.with_noise(s.exposure_s, seed)
+            for scan in (still, moving)
+        ]
         for method in s.methods:
             for error in estimates:
                 if method == "pwls" and (k > 1 or error):
@@ -294,12 +341,14 @@ def compensate(
                 volume = pieces(f"{method}_{error}_{seed}", run)
                 if seed is None and error is None:
                     rest[method] = volume
-                found.setdefault((method, error, seed is not None), []).append(observe(volume, reference, rest[method]))
+                found.setdefault((method, error, seed is not None), []).append(
+                    observe(volume, reference, rest[method])
+                )
         progress((k + 1) / len(noise))
     return found
 
 
-# --- the report -----------------------------------------------------------------------------------------------------
+# --- the report -----------------------------------------------------------------------------------
 
 
 def _up_to(errors: Sequence[float], good: Sequence[bool]) -> float | None:
@@ -318,11 +367,13 @@ def _core_right(found: dict[str, Any]) -> bool:
 
 
 def _borne(data: dict[str, Any]) -> dict[str, Any]:
-    """Up to which motion the PCCT's core survives: shares of the whole motion; None: not even the least was borne.
+    """Up to which motion the PCCT's core survives: shares of the whole motion; None: not even the
+    least was borne.
 
     Returns:
-        Of the image with residual motion ``contrast`` (within 20 % of that at rest) and ``core`` (segmented); of
-        noise-free FBP with a wrong estimate of the motion ``assumed_contrast``, and of every method ``assumed_core``.
+        Of the image with residual motion ``contrast`` (within 20 % of that at rest) and ``core``
+        (segmented); of noise-free FBP with a wrong estimate of the motion ``assumed_contrast``, and
+        of every method ``assumed_core``.
     """
     s, rest = data["settings"], data["at_rest"]["PCCT"]
     series = [r["in_place"] for r in data["residual"] if r["scanner"] == "PCCT"]
@@ -341,7 +392,9 @@ def _borne(data: dict[str, Any]) -> dict[str, Any]:
         "core": _up_to(s["fractions"], [_core_right(o) for o in series]),
         "core_at_rest": _core_right(rest),
         "assumed_contrast": _up_to(errors, [kept(o) for o in estimates["fbp"]]),
-        "assumed_core": {name: _up_to(errors, [_core_right(o) for o in found]) for name, found in whole.items()},
+        "assumed_core": {
+            name: _up_to(errors, [_core_right(o) for o in found]) for name, found in whole.items()
+        },
     }
 
 
@@ -349,7 +402,8 @@ def checks(data: dict[str, Any]) -> list[Check]:
     """The motion itself, what lumen and core bear of it, and the EID-CT beside the PCCT."""
     s, rest = data["settings"], data["at_rest"]["PCCT"]
     series, eid = (
-        {r["fraction"]: r["in_place"] for r in data["residual"] if r["scanner"] == name} for name in ("PCCT", "EID-CT")
+        {r["fraction"]: r["in_place"] for r in data["residual"] if r["scanner"] == name}
+        for name in ("PCCT", "EID-CT")
     )
     stable, tolerated = paper.MOTION["lumen_stable_below"], paper.MOTION["tolerated"]
     drift = {f: abs(100.0 * o["lumen_mm2"] / rest["lumen_mm2"] - 100.0) for f, o in series.items()}
@@ -363,12 +417,21 @@ def checks(data: dict[str, Any]) -> list[Check]:
         name = f"lumen area's change below {100 * stable:.0f} % of the motion, %"
         checks.append(Check(name, max(small), "stable", high=_TOLERANCE))
     if stable in drift and worst > stable:
-        name = f"lumen area's change at {100 * worst:.0f} % over that at {100 * stable:.0f} % of the motion"
-        checks.append(Check(name, drift[worst] / max(drift[stable], 1e-9), "suffers beyond", low=1.0))
+        name = (
+            f"lumen area's change at {100 * worst:.0f} % over that at {100 * stable:.0f} % of "
+            "the motion"
+        )
+        checks.append(
+            Check(name, drift[worst] / max(drift[stable], 1e-9), "suffers beyond", low=1.0)
+        )
     if tolerated in series:
         here, least, borne = series[tolerated], series[min(series)], data["borne"]["contrast"]
         if rest["core_found"]:
-            lost = 100.0 * abs(here["core_mm2"] / rest["core_mm2"] - 1.0) if here["core_found"] else 100.0
+            lost = (
+                100.0 * abs(here["core_mm2"] / rest["core_mm2"] - 1.0)
+                if here["core_found"]
+                else 100.0
+            )
             name = f"core area's change at {100 * tolerated:.0f} % (100: lost), %"
             more = f"more than the lumen's {drift[tolerated]:.1f}"
             checks.append(Check(name, lost, more, low=max(drift[tolerated], 1.0)))
@@ -380,7 +443,9 @@ def checks(data: dict[str, Any]) -> list[Check]:
         check = Check(name, float(_core_right(least)), "visible up to 20 %", low=1.0)
         checks.append(check.explained(f"no such region of 20–60 HU; {note}"))
     name = f"core segmented at {100 * worst:.0f} % of the motion (1: yes)"
-    checks.append(Check(name, float(series[worst]["core_found"]), "structures not reconstructed", high=0.0))
+    checks.append(
+        Check(name, float(series[worst]["core_found"]), "structures not reconstructed", high=0.0)
+    )
     if len(series) > 1:
         rise = min(np.diff([o["nrmse"] for o in series.values()]))
         checks.append(Check("smallest rise of the NRMSE with the motion", rise, "rises", low=0.0))
@@ -409,11 +474,23 @@ def _images(m: Found) -> Any:
     labels = []
 
     def title_of(error: float | None) -> str:
-        return "at rest" if error is None else f"wrong by {100 * error:.0f} %" if error else "true motion"
+        return (
+            "at rest"
+            if error is None
+            else f"wrong by {100 * error:.0f} %"
+            if error
+            else "true motion"
+        )
 
     for name, rest in m.at_rest.items():
-        found = {"at rest": rest, **{f"{100 * f:.0f} %": here for f, (here, _) in m.residuals(name).items()}}
-        rows += [[plaque_panel(o, title) for title, o in found.items()], [_error_map(o, rest) for o in found.values()]]
+        found = {
+            "at rest": rest,
+            **{f"{100 * f:.0f} %": here for f, (here, _) in m.residuals(name).items()},
+        }
+        rows += [
+            [plaque_panel(o, title) for title, o in found.items()],
+            [_error_map(o, rest) for o in found.values()],
+        ]
         labels += [name, "error"]
     for noisy in (False, True):
         for method, title in METHODS.items():
@@ -426,19 +503,32 @@ def _images(m: Found) -> Any:
                 rows.append(row)
                 labels.append(f"{title.split(' (')[0]}{', noise' if noisy else ''}")
     figure = panels(
-        rows, labels, "Residual motion, and compensation of the largest",
-        f"C150 / W600 HU; error maps C0 / W{_ERROR_WIDTH_HU:g} HU. Outlines: lumen (red), core where segmented "
+        rows,
+        labels,
+        "Residual motion, and compensation of the largest",
+        f"C150 / W600 HU; error maps C0 / W{_ERROR_WIDTH_HU:g} HU. Outlines: lumen (red), core "
+        "where segmented "
         "(yellow).",
-    )  # fmt: skip
+    )
     figure.set_size_inches(0.6 * figure.get_size_inches())  # ten rows of small images
     return figure
 
 
 def _curves(s: Settings, m: Found) -> Any:
-    """NRMSE, lumen area and depth of the core's basin against residual motion, uncompensated and compensated."""
-    figure, axes = curve_axes("residual motion, mm", ["NRMSE, %", "lumen area, of that at rest", "core's basin, HU"])
+    """NRMSE, lumen area and depth of the core's basin against residual motion, uncompensated and
+    compensated."""
+    figure, axes = curve_axes(
+        "residual motion, mm", ["NRMSE, %", "lumen area, of that at rest", "core's basin, HU"]
+    )
 
-    def draw(x: list[float], found: list[PlaqueImage], rest: PlaqueImage, marker: str, color: str, label: str) -> None:
+    def draw(
+        x: list[float],
+        found: list[PlaqueImage],
+        rest: PlaqueImage,
+        marker: str,
+        color: str,
+        label: str,
+    ) -> None:
         curves = (
             [100 * o["nrmse"] for o in found],
             [o["lumen_mm2"] / rest["lumen_mm2"] for o in found],

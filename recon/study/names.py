@@ -1,6 +1,7 @@
 """Names of settings and of hard cases, checked before anything that computes is loaded.
 
-They are read from the text of the studies' modules, where they are defined: a second list would fall behind.
+They are read from the text of the studies' modules, where they are defined: a second list would
+fall behind.
 """
 
 from __future__ import annotations
@@ -29,8 +30,16 @@ def setting_names(folder: str) -> tuple[str, ...]:
     for tree in (ast.parse(path.read_bytes()) for path in files if path.is_file()):
         for node in tree.body:
             if isinstance(node, ast.ClassDef) and node.name == "Settings":
-                lines = [n for n in node.body if isinstance(n, ast.AnnAssign) and isinstance(n.target, ast.Name)]
-                return tuple(ast.unparse(n.target) for n in lines if "ClassVar" not in ast.unparse(n.annotation))
+                lines = [
+                    n
+                    for n in node.body
+                    if isinstance(n, ast.AnnAssign) and isinstance(n.target, ast.Name)
+                ]
+                return tuple(
+                    ast.unparse(n.target)
+                    for n in lines
+                    if "ClassVar" not in ast.unparse(n.annotation)
+                )
     raise LookupError(f"no Settings in {files}")
 
 

@@ -1,12 +1,15 @@
-"""FBP of the plaque with every kernel, voxel size and dose: CNR tables, and which rankings they establish.
+"""FBP of the plaque with every kernel, voxel size and dose: CNR tables, and which rankings they
+establish.
 
-The ROI means of FBP are inner products of the line integrals with adjoint vectors (:mod:`recon.analytic.exact_noise`).
-So their joint covariance is exact, and hundreds of realisations cost one noisy scan each instead of a reconstruction
-per kernel and voxel size; a few are reconstructed in full beside, which must give the same ROI means.
+The ROI means of FBP are inner products of the line integrals with adjoint vectors
+(:mod:`recon.analytic.exact_noise`). So their joint covariance is exact, and hundreds of
+realisations cost one noisy scan each instead of a reconstruction per kernel and voxel size; a few
+are reconstructed in full beside, which must give the same ROI means.
 
-All settings (kernels × voxel sizes) of a realisation are made of one scan: their ROI means are jointly normal with that
-covariance. So three things are computable: the truth (exact CNR of every setting), what experiments of ten realisations
-would report (drawn from the joint law), and how sure a measured ranking is (paired bootstrap over its realisations).
+All settings (kernels × voxel sizes) of a realisation are made of one scan: their ROI means are
+jointly normal with that covariance. So three things are computable: the truth (exact CNR of every
+setting), what experiments of ten realisations would report (drawn from the joint law), and how sure
+a measured ranking is (paired bootstrap over its realisations).
 """
 
 from __future__ import annotations
@@ -28,7 +31,13 @@ from recon.analytic.exact_noise import roi_adjoints
 from recon.evaluate.store import Pieces
 from recon.study.figures import extent, roi_outlines
 from recon.study.paper import facts as paper
-from recon.study.paper.plaque_scan import REFERENCE_KERNEL, REFERENCE_VOXEL_MM, PlaqueScan, prepare, reference_fbp
+from recon.study.paper.plaque_scan import (
+    REFERENCE_KERNEL,
+    REFERENCE_VOXEL_MM,
+    PlaqueScan,
+    prepare,
+    reference_fbp,
+)
 from recon.study.report import Check, around
 from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.metrics.cnr import cnr_from_moments, cnr_interval, cnr_range, sd_interval
@@ -46,8 +55,9 @@ Floats = NDArray[np.float64]
 _BLOCK = 40
 """Realisations of a piece."""
 _SQUARES = 4
-"""Realisations per dose of which every reading's squared deviation is summed: 10⁶ independent readings pin the variance
-of an ROI mean down to some 0.1 %, which a few hundred ROI means do not."""
+"""Realisations per dose of which every reading's squared deviation is summed: 10⁶ independent
+readings pin the variance of an ROI mean down to some 0.1 %, which a few hundred ROI means do not.
+"""
 _TEN = paper.REALIZATIONS
 _BOOTSTRAP = 40_000
 _IMAGES_SCALE = 0.62  # noise does not compress: twenty panels stay below 400 kB at this size
@@ -90,7 +100,9 @@ class Settings(StudySettings):
     def __post_init__(self) -> None:
         self.check_whole(realizations=10, seed=0, views=8, reconstructed=1, experiments=100)
         if len(self.kernels) * len(self.voxels_mm) < 2:
-            raise ValueError("a ranking needs at least two settings: give more kernels or voxels_mm")
+            raise ValueError(
+                "a ranking needs at least two settings: give more kernels or voxels_mm"
+            )
         if len(self.doses) < 2:
             raise ValueError(f"doses must hold at least two exposures, got {self.doses}")
 
@@ -115,7 +127,8 @@ class Moments:
         expected: ``(S, 2)`` exact ROI means in HU: core, fibrous.
         covariance: ``(2 S, 2 S)`` HU² at 1 s, exact.
         means: exposure → ``(n, S, 2)`` ROI means of every realisation.
-        variances: exposure → ``(2 S,)`` variance of the ROI means from the readings' squared deviations, HU².
+        variances: exposure → ``(2 S,)`` variance of the ROI means from the readings' squared
+            deviations, HU².
         images: (kernel, voxel) → volume of one realisation at the tables' dose.
     """
 
@@ -128,14 +141,22 @@ class Moments:
 
     def exact(self, exposure_s: float) -> Table:
         """The truth at an exposure."""
-        return Table(self.expected, np.sqrt(np.diag(self.covariance) / exposure_s).reshape(self.expected.shape))
+        return Table(
+            self.expected,
+            np.sqrt(np.diag(self.covariance) / exposure_s).reshape(self.expected.shape),
+        )
 
 
-def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
-    """Simulate, take exact moments, draw realisations, reconstruct a few in full, in resumable pieces."""
+def measure(
+    settings: Settings, progress: Progress = silent, folder: str | Path | None = None
+) -> Measured:
+    """Simulate, take exact moments, draw realisations, reconstruct a few in full, in resumable
+    pieces."""
     s, pieces = settings, Pieces(folder, settings)
     scanner, full = presets.pcct(views=s.views), paper.FULL_VIEWS["PCCT"]
-    scanned = prepare(s.kernels, s.voxels_mm, plaque_scene(), scanner, full, partial(progress, "simulate"), pieces)
+    scanned = prepare(
+        s.kernels, s.voxels_mm, plaque_scene(), scanner, full, partial(progress, "simulate"), pieces
+    )
     clean = scanned.clean
     fine = reference_fbp(clean, scanned.fine)
     core, fibrous = (float(roi(fine)) for roi in scanned.rois.on(scanned.fine))
@@ -149,16 +170,22 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     means, variances = _realisations(s, near, matrix, expected, pieces, progress)
     m = Moments(scanned, expected, covariance, means, variances)
     exposure = s.table_exposure_s
-    full_runs = partial(_reconstructions, s, scanned, means[exposure], m.exact(exposure).sd, progress)
+    full_runs = partial(
+        _reconstructions, s, scanned, means[exposure], m.exact(exposure).sd, progress
+    )
     m.images, compared = pieces("full_reconstructions", full_runs)
     data = {
         "plan": dict(clean.info["plan"]),
         "rois": scanned.rois.as_dict(),
         "noise_free_reference": {
-            "kernel": REFERENCE_KERNEL, "voxel_mm": REFERENCE_VOXEL_MM, "foreground_hu": core,
+            "kernel": REFERENCE_KERNEL,
+            "voxel_mm": REFERENCE_VOXEL_MM,
+            "foreground_hu": core,
             "background_hu": fibrous,
         },
-        "order": "settings: voxel size slowest, then kernel; ROI means: setting, then core / fibrous",
+        "order": (
+            "settings: voxel size slowest, then kernel; ROI means: setting, then core / fibrous"
+        ),
         "axes": s.axes,
         "expected_hu": np.round(expected, 4),
         "covariance_hu2_at_1s": np.round(covariance, 4),
@@ -168,16 +195,21 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         "noise_against_dose": _against_dose(s, m),
         "ten_run_experiments": _ten_run_experiments(s, m, exposure),
         "pairs": _pairs(s, m, exposure),
-    }  # fmt: skip
+    }
     progress("statistics", 1.0)
     return Measured(s, data, m)
 
 
 def _realisations(
-    settings: Settings, near: Scan, matrix: Tensor, expected: Any, pieces: Pieces, progress: Progress
+    settings: Settings,
+    near: Scan,
+    matrix: Tensor,
+    expected: Any,
+    pieces: Pieces,
+    progress: Progress,
 ) -> tuple[dict[float, Any], dict[float, Any]]:
-    """``means`` and ``variances`` of :class:`Moments`, from the noise-free readings that the ROIs see and the adjoint
-    vectors, a row of ``matrix`` for every ROI mean."""
+    """``means`` and ``variances`` of :class:`Moments`, from the noise-free readings that the ROIs
+    see and the adjoint vectors, a row of ``matrix`` for every ROI mean."""
     quiet = near.line_integrals().flatten()
     means: dict[float, Any] = {}
     variances: dict[float, Any] = {}
@@ -188,15 +220,24 @@ def _realisations(
         def block(first: int, exposure: float = exposure) -> tuple[Any, Any]:
             values, squares = [], np.zeros(matrix.shape[0])
             for i in range(first, min(first + _BLOCK, n)):
-                deviation = near.with_noise(exposure, settings.seed + i).line_integrals().flatten() - quiet
-                values.append(expected + (matrix @ deviation).double().numpy().reshape(expected.shape))
+                deviation = (
+                    near.with_noise(exposure, settings.seed + i).line_integrals().flatten() - quiet
+                )
+                values.append(
+                    expected + (matrix @ deviation).double().numpy().reshape(expected.shape)
+                )
                 if i < _SQUARES:
                     for row, h in enumerate(matrix):
-                        squares[row] += float((h * deviation).square().sum(dtype=torch.float64)) / _SQUARES
+                        squares[row] += (
+                            float((h * deviation).square().sum(dtype=torch.float64)) / _SQUARES
+                        )
                 progress("noise realisations", (len(means) * n + i + 1) / total)
             return np.array(values), squares
 
-        found = [pieces(f"realisations/{exposure:g}s_{k}", partial(block, k)) for k in range(0, n, _BLOCK)]
+        found = [
+            pieces(f"realisations/{exposure:g}s_{k}", partial(block, k))
+            for k in range(0, n, _BLOCK)
+        ]
         means[exposure] = np.concatenate([values for values, _ in found])
         variances[exposure] = np.sum([squares for _, squares in found], axis=0)
     return means, variances
@@ -205,11 +246,14 @@ def _realisations(
 def _reconstructions(
     settings: Settings, scanned: PlaqueScan, means: Any, sd: Any, progress: Progress
 ) -> tuple[dict[tuple[str, float], Any], dict[str, Any]]:
-    """The first realisation's images at the tables' dose, and how far FBP in full is from ``means`` ``(n, S, 2)``."""
+    """The first realisation's images at the tables' dose, and how far FBP in full is from
+    ``means`` ``(n, S, 2)``."""
     images: list[Tensor] = []
     differences = []
     for i in range(min(settings.reconstructed, settings.realizations)):
-        volumes = scanned.fbp(scanned.clean.with_noise(settings.table_exposure_s, settings.seed + i))
+        volumes = scanned.fbp(
+            scanned.clean.with_noise(settings.table_exposure_s, settings.seed + i)
+        )
         differences.append(scanned.roi_means(volumes) - means[i])
         images = images or [image for grid in volumes for image in grid]
         progress("full reconstructions", (i + 1) / settings.reconstructed)
@@ -222,21 +266,33 @@ def _reconstructions(
 
 
 def _dose_table(s: Settings, m: Moments, exposure: float) -> list[dict[str, Any]]:
-    """One row per setting: exact, by all realisations, by the first ten, and the paper's entries."""
+    """One row per setting: exact, by all realisations, by the first ten, and the paper's
+    entries."""
     exact, values = m.exact(exposure), m.means[exposure]
 
     def sampled(runs: Any, i: int, **more: Any) -> dict[str, Any]:
         table = measured_table(runs[:, i : i + 1])
         interval = list(cnr_interval(runs[:, i, 0], runs[:, i, 1]))
-        return {"mean_hu": table.mean[0], "sd_hu": table.sd[0], "cnr": table.cnr[0], "cnr_interval": interval, **more}
+        return {
+            "mean_hu": table.mean[0],
+            "sd_hu": table.sd[0],
+            "cnr": table.cnr[0],
+            "cnr_interval": interval,
+            **more,
+        }
 
     rows = []
     for i, (kernel, voxel) in enumerate(s.axes):
         measured, ten = sampled(values, i), sampled(values[:_TEN], i)
-        measured["sd_interval"] = [list(sd_interval(float(v), len(values))) for v in measured["sd_hu"]]
+        measured["sd_interval"] = [
+            list(sd_interval(float(v), len(values))) for v in measured["sd_hu"]
+        ]
         both = slice(2 * i, 2 * i + 2)
         ten["cnr_range"] = list(cnr_range(exact.mean[i], m.covariance[both, both] / exposure, _TEN))
-        theirs = [published(t, kernel, voxel, exposure) for t in (paper.FOREGROUND, paper.BACKGROUND, paper.CNR)]
+        theirs = [
+            published(t, kernel, voxel, exposure)
+            for t in (paper.FOREGROUND, paper.BACKGROUND, paper.CNR)
+        ]
         rows.append(
             {
                 "kernel": kernel,
@@ -252,10 +308,12 @@ def _dose_table(s: Settings, m: Moments, exposure: float) -> list[dict[str, Any]
 
 
 def _against_dose(s: Settings, m: Moments) -> dict[str, Any]:
-    """Slope of log σ of the ROI means against log exposure, −½ for counting noise, and how exact the noise is.
+    """Slope of log σ of the ROI means against log exposure, −½ for counting noise, and how exact
+    the noise is.
 
-    ``slopes``: ``(2 S,)``, from the readings' squared deviations; ``sampled_slopes``: from the SDs of the realisations;
-    ``variance_ratios``: lowest and highest of the first variances over the exact ones; ``sd_ratios``: of the SDs.
+    ``slopes``: ``(2 S,)``, from the readings' squared deviations; ``sampled_slopes``: from the SDs
+    of the realisations; ``variance_ratios``: lowest and highest of the first variances over the
+    exact ones; ``sd_ratios``: of the SDs.
     """
     doses = np.log(list(s.doses.values()))
     variances = np.array([m.variances[e] for e in s.doses.values()])
@@ -281,18 +339,23 @@ def _ten_run_experiments(s: Settings, m: Moments, exposure: float) -> dict[str, 
 
 
 def _pairs(s: Settings, m: Moments, exposure: float) -> dict[str, Any]:
-    """CNR differences: the paper's best against all others, and how many of all pairs are established."""
+    """CNR differences: the paper's best against all others, and how many of all pairs are
+    established."""
     axes, exact = s.axes, m.exact(exposure)
     best = ("soft", 0.25) if ("soft", 0.25) in axes else axes[int(np.argmax(exact.cnr))]
     a = axes.index(best)
     values, others = m.means[exposure], [(a, b) for b in range(len(axes)) if b != a]
     single = pair_differences(values, exact, others, draws=_BOOTSTRAP, seed=s.seed)
     every = list(itertools.combinations(range(len(axes)), 2))
-    joint = pair_differences(values, exact, every, level=1 - 0.05 / len(every), draws=_BOOTSTRAP, seed=s.seed)
+    joint = pair_differences(
+        values, exact, every, level=1 - 0.05 / len(every), draws=_BOOTSTRAP, seed=s.seed
+    )
     found = [p for p in joint if p.established]
     theirs, agree = [published(paper.CNR, k, v, exposure) for k, v in axes], None
     if None not in theirs:
-        agree = sum(np.sign(p.difference) == np.sign(theirs[p.first] - theirs[p.second]) for p in found)
+        agree = sum(
+            np.sign(p.difference) == np.sign(theirs[p.first] - theirs[p.second]) for p in found
+        )
     return {
         "reference": f"{best[0]} {best[1]:.2f} mm",
         "against": [
@@ -313,7 +376,7 @@ def _pairs(s: Settings, m: Moments, exposure: float) -> dict[str, Any]:
     }
 
 
-# --- statistics -----------------------------------------------------------------------------------------------------
+# --- statistics -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -330,7 +393,9 @@ class Table:
     @property
     def cnr(self) -> Floats:
         """``(..., settings)``."""
-        return np.asarray(cnr_from_moments(self.mean[..., 0], self.sd[..., 0], self.mean[..., 1], self.sd[..., 1]))
+        return np.asarray(
+            cnr_from_moments(self.mean[..., 0], self.sd[..., 0], self.mean[..., 1], self.sd[..., 1])
+        )
 
 
 def measured_table(means: Any) -> Table:
@@ -340,19 +405,21 @@ def measured_table(means: Any) -> Table:
 
 
 def few_run_tables(mean: Any, covariance: Any, draws: int, seed: int) -> Table:
-    """Tables that so many experiments of ten realisations would report, whose ROI means ``(settings, 2)`` HU have this
-    covariance ``(2 · settings, 2 · settings)`` HU²."""
+    """Tables that so many experiments of ten realisations would report, whose ROI means
+    ``(settings, 2)`` HU have this covariance ``(2 · settings, 2 · settings)`` HU²."""
     rng, parts = np.random.default_rng(seed), []
     for start in range(0, draws, 1000):
         shape = (min(1000, draws - start), _TEN)
-        runs = rng.multivariate_normal(np.ravel(mean), covariance, shape, check_valid="ignore", method="eigh")
+        runs = rng.multivariate_normal(
+            np.ravel(mean), covariance, shape, check_valid="ignore", method="eigh"
+        )
         parts.append(measured_table(runs.reshape(*shape, *np.shape(mean))))
     return Table(np.concatenate([p.mean for p in parts]), np.concatenate([p.sd for p in parts]))
 
 
 def resampled_tables(values: Floats, indices: NDArray[np.int64]) -> Table:
-    """Tables of resamples of ``(n, settings, 2)`` ROI means, by counts: moments are linear in how often each
-    realisation was drawn."""
+    """Tables of resamples of ``(n, settings, 2)`` ROI means, by counts: moments are linear in how
+    often each realisation was drawn."""
     n = len(values)
     size = indices.shape[1]
     counts = np.zeros((len(indices), n))
@@ -388,15 +455,23 @@ class Pair:
         return self.low > 0 or self.high < 0
 
     def runs_needed(self, n: int) -> float:
-        """Paired realisations for an 80 % chance that a 95 % interval excludes zero, from one of ``n``."""
+        """Paired realisations for an 80 % chance that a 95 % interval excludes zero, from one of
+        ``n``."""
         error = (self.high - self.low) / (2 * 1.96)
         return float(n * ((1.96 + 0.84) * error / self.exact) ** 2) if self.exact else float("inf")
 
 
 def pair_differences(
-    means: Any, exact: Table, pairs: Sequence[tuple[int, int]], *, level: float = 0.95, draws: int = 4000, seed: int = 0
+    means: Any,
+    exact: Table,
+    pairs: Sequence[tuple[int, int]],
+    *,
+    level: float = 0.95,
+    draws: int = 4000,
+    seed: int = 0,
 ) -> list[Pair]:
-    """Differences of CNR between settings with paired bootstrap intervals (BCa) of coverage ``level``.
+    """Differences of CNR between settings with paired bootstrap intervals (BCa) of coverage
+    ``level``.
 
     ``means``: ``(n, settings, 2)`` HU; the same resamples serve all pairs.
     """
@@ -407,44 +482,63 @@ def pair_differences(
     result = []
     for a, b in pairs:
         value = float(measured[a] - measured[b])
-        low, high = bca_interval(value, boot[:, a] - boot[:, b], jackknife[:, a] - jackknife[:, b], level)
+        low, high = bca_interval(
+            value, boot[:, a] - boot[:, b], jackknife[:, a] - jackknife[:, b], level
+        )
         result.append(Pair(a, b, value, low, high, float(exact.cnr[a] - exact.cnr[b])))
     return result
 
 
-# --- the report -----------------------------------------------------------------------------------------------------
+# --- the report -----------------------------------------------------------------------------------
 
 
 def checks(data: dict[str, Any]) -> list[Check]:
-    """The paper's tables beside the exact figures, the slope of the noise, and the full reconstructions."""
+    """The paper's tables beside the exact figures, the slope of the noise, and the full
+    reconstructions."""
     found = []
     for name, value in paper.NOISE_FREE_ROI_HU.items():
         ours = data["noise_free_reference"][f"{name}_hu"]
         found.append(around(f"noise-free {name} mean, standard 0.10 mm, HU", ours, value, 8.0))
     covariance = np.asarray(data["covariance_hu2_at_1s"]) / paper.TABLE_EXPOSURE_S
-    for i, ((kernel, voxel), means) in enumerate(zip(data["axes"], data["expected_hu"], strict=True)):
-        found += table_checks(kernel, voxel, means, covariance[2 * i : 2 * i + 2, 2 * i : 2 * i + 2])
+    for i, ((kernel, voxel), means) in enumerate(
+        zip(data["axes"], data["expected_hu"], strict=True)
+    ):
+        found += table_checks(
+            kernel, voxel, means, covariance[2 * i : 2 * i + 2, 2 * i : 2 * i + 2]
+        )
     slopes = data["noise_against_dose"]["slopes"]
     for name, slope in (("lowest", min(slopes)), ("highest", max(slopes))):
-        found.append(around(f"slope of σ against dose, {name} of all ROI means", float(slope), -0.5, 0.015))
+        found.append(
+            around(f"slope of σ against dose, {name} of all ROI means", float(slope), -0.5, 0.015)
+        )
     far = data["full_reconstructions"]["largest_difference_in_sd"]
-    return [*found, Check("full reconstructions: difference of ROI means, SDs", far, "–", 0.0, 0.05)]
+    return [
+        *found,
+        Check("full reconstructions: difference of ROI means, SDs", far, "–", 0.0, 0.05),
+    ]
 
 
 def published(table: Any, kernel: str, voxel_mm: float, exposure_s: float) -> Any:
     """The entry of one of the paper's tables for FBP at this setting, or None."""
-    if exposure_s != paper.TABLE_EXPOSURE_S or kernel not in paper.KERNELS or voxel_mm not in paper.VOXELS_MM:
+    if (
+        exposure_s != paper.TABLE_EXPOSURE_S
+        or kernel not in paper.KERNELS
+        or voxel_mm not in paper.VOXELS_MM
+    ):
         return None
     return table[paper.KERNELS.index(kernel)][paper.VOXELS_MM.index(voxel_mm)]
 
 
-def table_checks(kernel: str, voxel_mm: float, means_hu: Sequence[float], covariance_hu2: Any) -> list[Check]:
-    """The paper's tables against the exact expectation and covariance of the core's and the fibrous ROI mean at their
-    exposure: no sampling error.
+def table_checks(
+    kernel: str, voxel_mm: float, means_hu: Sequence[float], covariance_hu2: Any
+) -> list[Check]:
+    """The paper's tables against the exact expectation and covariance of the core's and the fibrous
+    ROI mean at their exposure: no sampling error.
 
     Returns:
-        Means ± 10 HU, SDs within a factor of 1.5, and the paper's CNR inside the range that 95 of 100 experiments with
-        10 realisations of our scan would give; nothing where the paper has no entry.
+        Means ± 10 HU, SDs within a factor of 1.5, and the paper's CNR inside the range that 95 of
+        100 experiments with 10 realisations of our scan would give; nothing where the paper has no
+        entry.
     """
     checks = []
     covariance = np.asarray(covariance_hu2, dtype=np.float64)
@@ -455,7 +549,11 @@ def table_checks(kernel: str, voxel_mm: float, means_hu: Sequence[float], covari
             return []
         mean, sd = (float(v) for v in entry)
         error = f"standard error of the paper's mean: {sd / _TEN**0.5:.0f} HU"
-        checks.append(Check(f"{roi} mean, {name}, HU", means_hu[i], mean, mean - 10, mean + 10).explained(error))
+        checks.append(
+            Check(f"{roi} mean, {name}, HU", means_hu[i], mean, mean - 10, mean + 10).explained(
+                error
+            )
+        )
         ours = float(np.sqrt(covariance[i, i]))
         ratio = (_TEN - 1) * (sd / ours) ** 2
         tail = (stats.chi2.cdf if sd < ours else stats.chi2.sf)(ratio, _TEN - 1)
@@ -463,7 +561,9 @@ def table_checks(kernel: str, voxel_mm: float, means_hu: Sequence[float], covari
         checks.append(Check(f"{roi} SD, {name}, HU", ours, sd, sd / 1.5, sd * 1.5).explained(rare))
     cnr = float(published(paper.CNR, kernel, voxel_mm, paper.TABLE_EXPOSURE_S))
     low, high = cnr_range(means_hu, covariance, _TEN)
-    checks.append(Check(f"the paper's CNR, {name}, in the range of our 10-run estimates", cnr, cnr, low, high))
+    checks.append(
+        Check(f"the paper's CNR, {name}, in the range of our 10-run estimates", cnr, cnr, low, high)
+    )
     return checks
 
 
@@ -471,7 +571,10 @@ def figures(measured: Measured) -> dict[str, Any]:
     """Images of every setting, and CNRs with their uncertainty, at the tables' dose."""
     s, m = measured.settings, measured.seen
     name = next(name for name, dose in s.doses.items() if dose == s.table_exposure_s)
-    return {"noise_images.png": _images(s, m), "noise_cnr.png": _cnrs(s, measured.data["doses"][name])}
+    return {
+        "noise_images.png": _images(s, m),
+        "noise_cnr.png": _cnrs(s, measured.data["doses"][name]),
+    }
 
 
 def _images(s: Settings, m: Moments) -> Any:
@@ -497,7 +600,8 @@ def _images(s: Settings, m: Moments) -> Any:
 
 
 def _cnrs(s: Settings, rows: list[dict[str, Any]]) -> Any:
-    """CNR of every setting: exact, n realisations with interval, range of 10-run experiments, the paper's."""
+    """CNR of every setting: exact, n realisations with interval, range of 10-run experiments,
+    the paper's."""
     from matplotlib.figure import Figure
 
     exposure, kernels = s.table_exposure_s, s.kernels
@@ -508,14 +612,28 @@ def _cnrs(s: Settings, rows: list[dict[str, Any]]) -> Any:
     for ax, kernel in zip(axes, kernels, strict=True):
         own = [r for r in rows if r["kernel"] == kernel]
         bands = np.array([r["ten_runs"]["cnr_range"] for r in own])
-        ax.fill_between(x, bands[:, 0], bands[:, 1], color="0.85", label="95 % of 10-run experiments", linewidth=0)
+        ax.fill_between(
+            x,
+            bands[:, 0],
+            bands[:, 1],
+            color="0.85",
+            label="95 % of 10-run experiments",
+            linewidth=0,
+        )
         ax.plot(x, [r["exact"]["cnr"] for r in own], color="black", linewidth=1.2, label="exact")
         middle = np.array([r["measured"]["cnr"] for r in own])
         ends = np.array([r["measured"]["cnr_interval"] for r in own])
         ax.errorbar(
-            x + 0.12 * step, middle, [middle - ends[:, 0], ends[:, 1] - middle], fmt="o", markersize=3, capsize=2,
-            color="tab:blue", linewidth=1, label=f"n = {s.realizations}, 95 %",
-        )  # fmt: skip
+            x + 0.12 * step,
+            middle,
+            [middle - ends[:, 0], ends[:, 1] - middle],
+            fmt="o",
+            markersize=3,
+            capsize=2,
+            color="tab:blue",
+            linewidth=1,
+            label=f"n = {s.realizations}, 95 %",
+        )
         entries = [r["paper"]["cnr"] for r in own if r["paper"] is not None]
         if len(entries) == len(own):
             ax.plot(x, entries, "x", color="tab:red", label="paper (n = 10)")

@@ -1,7 +1,7 @@
 """The plaque itself beside the paper's: what it is made of, what it reads in HU, and its lengths.
 
-Lengths are those of the analytic bodies, and measured on a binary raster of them, which lies along the plaque's own
-axes: z along the vessel, x from its axis to the plaque.
+Lengths are those of the analytic bodies, and measured on a binary raster of them, which lies along
+the plaque's own axes: z along the vessel, x from its axis to the plaque.
 """
 
 from __future__ import annotations
@@ -27,17 +27,22 @@ from torchpcct.viz import Panel, panels
 
 __all__ = ["Settings", "checks", "figures", "measure"]
 
-TRANSMITTED, MIDDLE = "100 kVp behind 24 cm fat", "64 keV"
+TRANSMITTED = "100 kVp behind 24 cm fat"
+MIDDLE = "64 keV"
 """Spectra whose CT numbers are checked."""
 
-_LENGTH_MM, _OFFSET_MM = 0.02, 0.1
+_LENGTH_MM = 0.02
+_OFFSET_MM = 0.1
 """Accepted error of a length; of those that the paper gives with one decimal, in cm and in mm."""
 
-_SOFT_HU, _BLOOD_HU, _FAT_HU = 6.0, (400.0, 600.0), (-130.0, -85.0)
+_SOFT_HU = 6.0
+_BLOOD_HU = (400.0, 600.0)
+_FAT_HU = (-130.0, -85.0)
 """Accepted CT numbers: of soft tissue about the paper's, of blood and of fat."""
 
 _SHOWN_KEV = 64.0  # of the picture: there the soft tissues have the paper's CT numbers
-_PIXEL_MM, _HALF_MM = 0.02, 2.75
+_PIXEL_MM = 0.02
+_HALF_MM = 2.75
 _MARGIN_MM = 0.1
 
 
@@ -64,16 +69,23 @@ class Settings(StudySettings):
         object.__setattr__(self, "energies_kev", energies)
 
 
-def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
+def measure(
+    settings: Settings, progress: Progress = silent, folder: str | Path | None = None
+) -> Measured:
     """Materials and lengths; nothing is kept in ``folder``."""
     scene, plaque = plaque_scene()
     hu = ct_numbers(settings.energies_kev)
     published = {name: value for name, (_, value, _) in paper.MATERIALS.items()}
     soft = ("vessel_wall", "fibrous_tissue", "necrotic_core")
     data: dict[str, Any] = {
-        "materials": compositions(), "hu": hu, "published_hu": published,
-        "nearest": {"soft": _nearest(hu, {n: published[n] for n in soft}), "all": _nearest(hu, published)},
-    }  # fmt: skip
+        "materials": compositions(),
+        "hu": hu,
+        "published_hu": published,
+        "nearest": {
+            "soft": _nearest(hu, {n: published[n] for n in soft}),
+            "all": _nearest(hu, published),
+        },
+    }
     progress("materials", 1.0)
     data["lengths_mm"] = {
         "bodies": analytic_lengths(scene, plaque),
@@ -87,7 +99,8 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
 def compositions() -> list[dict[str, Any]]:
     """Per material: density, mass fractions, and their largest difference to the paper's table.
 
-    The library's own fractions are the paper's table, normalised: agreement says that it was copied rightly.
+    The library's own fractions are the paper's table, normalised: agreement says that it was copied
+    rightly.
     """
     rows = []
     for name, (density, _, published) in paper.MATERIALS.items():
@@ -99,7 +112,9 @@ def compositions() -> list[dict[str, Any]]:
                 "published_g_cm3": density,
                 "fractions": found,
                 "published": dict(published),
-                "fraction_error": max(abs(found.get(e, 0.0) - published.get(e, 0.0)) for e in {*found, *published}),
+                "fraction_error": max(
+                    abs(found.get(e, 0.0) - published.get(e, 0.0)) for e in {*found, *published}
+                ),
             }
         )
     return rows
@@ -108,8 +123,9 @@ def compositions() -> list[dict[str, Any]]:
 def ct_numbers(energies_kev: tuple[float, ...]) -> dict[str, dict[str, float]]:
     """Spectrum → material → HU against water.
 
-    Monochromatic; then of the photons that leave the tube, of those behind the patient (the scanner's filters, the
-    large bowtie's middle, 24 cm of fat), and of the signals that PCCT and EID-CT make of these.
+    Monochromatic; then of the photons that leave the tube, of those behind the patient (the
+    scanner's filters, the large bowtie's middle, 24 cm of fat), and of the signals that PCCT and
+    EID-CT make of these.
     """
     spectra: dict[str, tuple[Any, Any]] = {f"{e:g} keV": (e, 1.0) for e in energies_kev}
     patient = {MATERIALS["pericoronary_fat"]: PATIENT_DIAMETER}
@@ -120,23 +136,34 @@ def ct_numbers(energies_kev: tuple[float, ...]) -> dict[str, dict[str, float]]:
     spectra["100 kVp, filtered, in air"] = energies, photons[middle]
     spectra[TRANSMITTED] = energies, photons[middle] * np.exp(-behind)
     spectra["the same, counted by the PCCT"] = energies, pcct.behind(patient)[0, middle]
-    spectra["the same, integrated by the EID-CT"] = eid.weights()[0], eid.behind(patient)[0, eid.geometry.columns // 2]
-    return {name: {m: MATERIALS[m].hu(*spectrum) for m in paper.MATERIALS} for name, spectrum in spectra.items()}
+    spectra["the same, integrated by the EID-CT"] = (
+        eid.weights()[0],
+        eid.behind(patient)[0, eid.geometry.columns // 2],
+    )
+    return {
+        name: {m: MATERIALS[m].hu(*spectrum) for m in paper.MATERIALS}
+        for name, spectrum in spectra.items()
+    }
 
 
 def _nearest(hu: dict[str, dict[str, float]], published: dict[str, float]) -> dict[str, Any]:
-    """The spectrum whose CT numbers come nearest to the published ones, and the largest difference."""
-    miss = {spectrum: max(abs(found[n] - v) for n, v in published.items()) for spectrum, found in hu.items()}
+    """The spectrum whose CT numbers come nearest to the published ones, and the largest
+    difference."""
+    miss = {
+        spectrum: max(abs(found[n] - v) for n, v in published.items())
+        for spectrum, found in hu.items()
+    }
     best = min(miss, key=lambda spectrum: miss[spectrum])
     return {"spectrum": best, "hu": miss[best]}
 
 
-# --- lengths --------------------------------------------------------------------------------------------------------
+# --- lengths --------------------------------------------------------------------------------------
 
 
 def analytic_lengths(scene: Scene, plaque: Plaque) -> dict[str, float]:
     """Lengths in mm of the bodies, named as the paper's."""
-    away = 0.5 * (plaque.bulge_length + plaque.vessel_length) / 2.0  # on either side of here there is no plaque
+    # on either side of here there is no plaque
+    away = 0.5 * (plaque.bulge_length + plaque.vessel_length) / 2.0
     outer, inner = (float(plaque.section(name, away)[2]) for name in ("outer", "inner"))
     minor, _, major = sorted(2.0 * a for a in plaque.core.semi_axes)
     patient = scene["patient"].shape
@@ -164,24 +191,33 @@ def assumptions(plaque: Plaque) -> dict[str, float]:
     }
 
 
-def raster_lengths(scene: Scene, plaque: Plaque, voxel_mm: float, sections: int) -> dict[str, float]:
+def raster_lengths(
+    scene: Scene, plaque: Plaque, voxel_mm: float, sections: int
+) -> dict[str, float]:
     """The same lengths on voxels that are what their centre is.
 
-    Core: extents of its voxels. Cap: smallest distance between voxels of core and lumen, less one voxel. Vessel and
-    wall: extents of their voxels across the plaque's direction, mean over sections beyond the plaque; distance from the
-    isocentre: of the vessel's centre of mass there. Patient: voxels on a line through the isocentre.
+    Core: extents of its voxels. Cap: smallest distance between voxels of core and lumen, less one
+    voxel. Vessel and wall: extents of their voxels across the plaque's direction, mean over
+    sections beyond the plaque; distance from the isocentre: of the vessel's centre of mass there.
+    Patient: voxels on a line through the isocentre.
     """
     around = tuple(a + plaque.minimum_cap + _MARGIN_MM for a in plaque.core.semi_axes)
     labels = _raster(scene, plaque, plaque.core_center, around, voxel_mm)[0]
     inside, lumen = (labels == scene.index(name) for name in ("core", "lumen"))
-    cap = distance_transform_edt(~lumen, sampling=voxel_mm)[inside].min() - voxel_mm if lumen.any() else math.nan
+    cap = (
+        distance_transform_edt(~lumen, sampling=voxel_mm)[inside].min() - voxel_mm
+        if lumen.any()
+        else math.nan
+    )
     extents = [float(inside.any(axes).sum() * voxel_mm) for axes in ((0, 1), (0, 2), (1, 2))]
     low, high = 0.5 * plaque.bulge_length, 0.5 * plaque.vessel_length
     heights = low + (np.arange(sections) + 0.5) * (high - low) / sections
     diameters, walls, centres = [], [], []
     reach = plaque.vessel_diameter / 2.0 + _MARGIN_MM
     for z in heights:
-        labels, points = _raster(scene, plaque, (0.0, 0.0, float(z)), (reach, reach, 0.5 * voxel_mm), voxel_mm)
+        labels, points = _raster(
+            scene, plaque, (0.0, 0.0, float(z)), (reach, reach, 0.5 * voxel_mm), voxel_mm
+        )
         vessel = labels != scene.index("patient")
         across = labels[0, :, labels.shape[2] // 2]  # to the plaque's direction
         wall = across == scene.index("wall")
@@ -203,7 +239,9 @@ def raster_lengths(scene: Scene, plaque: Plaque, voxel_mm: float, sections: int)
     }
 
 
-def _raster(scene: Scene, plaque: Plaque, center: Any, half: Any, voxel_mm: float) -> tuple[Any, Any]:
+def _raster(
+    scene: Scene, plaque: Plaque, center: Any, half: Any, voxel_mm: float
+) -> tuple[Any, Any]:
     """Labels ``(z, y, x)`` of a box in the plaque's frame, and its points in the scanner's."""
     n = [max(1, 2 * math.floor(h / voxel_mm) + 1) for h in half][::-1]
     z, y, x = VolumeGrid(tuple(n), voxel_mm, tuple(center)[::-1]).axes
@@ -212,7 +250,7 @@ def _raster(scene: Scene, plaque: Plaque, center: Any, half: Any, voxel_mm: floa
     return scene.labels(points), points
 
 
-# --- the report -----------------------------------------------------------------------------------------------------
+# --- the report -----------------------------------------------------------------------------------
 
 
 def checks(data: dict[str, Any]) -> list[Check]:
@@ -220,7 +258,9 @@ def checks(data: dict[str, Any]) -> list[Check]:
     found = []
     for m in data["materials"]:
         name = m["material"].replace("_", " ")
-        found.append(around(f"{name}: density, g/cm³", m["density_g_cm3"], m["published_g_cm3"], 5e-4))
+        found.append(
+            around(f"{name}: density, g/cm³", m["density_g_cm3"], m["published_g_cm3"], 5e-4)
+        )
         # Blood's table sums to 1.0002: normalising moves oxygen by 1.5e-4.
         error = f"{name}: largest error of a mass fraction"
         found.append(Check(error, m["fraction_error"], "0, normalised", high=2e-4))
@@ -230,16 +270,25 @@ def checks(data: dict[str, Any]) -> list[Check]:
             target = paper.MATERIALS[material][1]
             low, high = accepted.get(material, (target - _SOFT_HU, target + _SOFT_HU))
             check = Check(f"{material.replace('_', ' ')}, HU, {spectrum}", hu, target, low, high)
-            found.append(check.explained("the energy that gives soft tissue does not give blood and fat, see below"))
+            found.append(
+                check.explained(
+                    "the energy that gives soft tissue does not give blood and fat, see below"
+                )
+            )
     for how, lengths in data["lengths_mm"].items():
         for name, value in lengths.items():
-            tolerance = _OFFSET_MM if name in ("distance from the isocentre", "patient diameter") else _LENGTH_MM
+            tolerance = (
+                _OFFSET_MM
+                if name in ("distance from the isocentre", "patient diameter")
+                else _LENGTH_MM
+            )
             found.append(around(f"{name}, mm, {how}", value, paper.PHANTOM_MM[name], tolerance))
     return found
 
 
 def figures(measured: Measured) -> dict[str, Any]:
-    """Axial section through the plaque's middle, and the section along the vessel through wall, core and lumen."""
+    """Axial section through the plaque's middle, and the section along the vessel through wall,
+    core and lumen."""
     scene, plaque = plaque_scene()
     values = np.array([m.hu(_SHOWN_KEV) for m in scene.materials])
     across = np.arange(-_HALF_MM, _HALF_MM, _PIXEL_MM) + 0.5 * _PIXEL_MM
@@ -248,7 +297,9 @@ def figures(measured: Measured) -> dict[str, Any]:
 
     def panel(x: Any, y: Any, z: Any, vertical: float, title: str) -> Panel:
         points = plaque.to_scanner(np.stack(np.broadcast_arrays(x, y, z), -1))
-        return Panel(values[scene.labels(points)], (-_HALF_MM, _HALF_MM, -vertical, vertical), title)
+        return Panel(
+            values[scene.labels(points)], (-_HALF_MM, _HALF_MM, -vertical, vertical), title
+        )
 
     line, zero, core = across[None, :], np.zeros(1), np.full(1, plaque.core_center[0])
     row = [

@@ -22,15 +22,36 @@ if TYPE_CHECKING:
 __all__ = ["STUDIES", "build_settings", "folder", "measured", "part", "report_of", "run"]
 
 STUDIES: dict[str, str] = {
-    "compare": "what dose MBIR saves at the paper's plaque, beside FBP, PWLS and the best simple filter",
-    "phantom": "the plaque itself: densities, mass fractions, CT numbers and lengths beside the paper's",
-    "detector": "the silicon detector: counts, DQE beside the published one, pile-up, charge sharing",
-    "bowtie": "ROI bowtie: CTDI and thorax dose, noise inside and outside, and its product with MBIR",
-    "motion": "residual motion in PCCT and EID-CT, and reconstruction with the motion known, exactly or not",
-    "noise": "FBP with every kernel, voxel size and dose: CNR tables, and which rankings they establish",
-    "resolution": "PCCT and EID-CT without noise, blurred step by step: lumen, cap and core by thresholds",
-    "hardcases": "scans with too few photons, faults, missing data or a wrong description: which results are wrong",
-    "spectral": "energy bins into PE and PVC: monochromatic images, best energy, tissue maps, by FBP and joint MBIR",
+    "compare": (
+        "what dose MBIR saves at the paper's plaque, beside FBP, PWLS and the best simple filter"
+    ),
+    "phantom": (
+        "the plaque itself: densities, mass fractions, CT numbers and lengths beside the paper's"
+    ),
+    "detector": (
+        "the silicon detector: counts, DQE beside the published one, pile-up, charge sharing"
+    ),
+    "bowtie": (
+        "ROI bowtie: CTDI and thorax dose, noise inside and outside, and its product with MBIR"
+    ),
+    "motion": (
+        "residual motion in PCCT and EID-CT, and reconstruction with the motion known, "
+        "exactly or not"
+    ),
+    "noise": (
+        "FBP with every kernel, voxel size and dose: CNR tables, and which rankings they establish"
+    ),
+    "resolution": (
+        "PCCT and EID-CT without noise, blurred step by step: lumen, cap and core by thresholds"
+    ),
+    "hardcases": (
+        "scans with too few photons, faults, missing data or a wrong description: which "
+        "results are wrong"
+    ),
+    "spectral": (
+        "energy bins into PE and PVC: monochromatic images, best energy, tissue maps, by "
+        "FBP and joint MBIR"
+    ),
 }
 """Name → one line of help. The study ``some-name`` is the module ``recon.study.some_name``."""
 
@@ -56,17 +77,21 @@ def part(name: str) -> Any:
     return importlib.import_module(f"recon.study.{folder(name)}")
 
 
-def build_settings(name: str, *, quick: bool = False, seed: int | None = None, changes: Sequence[str] = ()) -> Any:
+def build_settings(
+    name: str, *, quick: bool = False, seed: int | None = None, changes: Sequence[str] = ()
+) -> Any:
     """Settings of a study from command-line values.
 
     Args:
         name: of the study.
         quick: start from the reduced settings.
         seed: first seed of the noise, where the study draws noise.
-        changes: ``"field=value"`` pairs, the value a Python literal (or a bare word, taken as text).
+        changes: ``"field=value"`` pairs, the value a Python literal (or a bare word, taken as
+            text).
 
     Raises:
-        ValueError: an unknown study or field, a change without ``=``, a value that the settings refuse.
+        ValueError: an unknown study or field, a change without ``=``, a value that the settings
+            refuse.
         TypeError: a value of a wrong type.
     """
     known = setting_names(folder(name))
@@ -81,19 +106,24 @@ def build_settings(name: str, *, quick: bool = False, seed: int | None = None, c
     return kind.of(values, quick)
 
 
-def run(name: str, settings: Any, progress: Progress | None = None, pieces: str | Path | None = None) -> Report:
+def run(
+    name: str, settings: Any, progress: Progress | None = None, pieces: str | Path | None = None
+) -> Report:
     """Measure a study and build its report, which is not saved; see :func:`measured`."""
     return report_of(name, measured(name, settings, progress, pieces))
 
 
-def measured(name: str, settings: Any, progress: Progress | None = None, pieces: str | Path | None = None) -> Measured:
+def measured(
+    name: str, settings: Any, progress: Progress | None = None, pieces: str | Path | None = None
+) -> Measured:
     """Measure a study.
 
     Args:
         name: of the study.
         settings: of that study.
         progress: called with the name of the step and its finished fraction.
-        pieces: folder for finished pieces, which the next run of the same settings reuses; None: nothing is kept.
+        pieces: folder for finished pieces, which the next run of the same settings reuses; None:
+            nothing is kept.
 
     Raises:
         ValueError: an unknown study; what the study itself refuses.
@@ -104,7 +134,9 @@ def measured(name: str, settings: Any, progress: Progress | None = None, pieces:
     study = part(name)
     if not isinstance(settings, study.Settings):
         kind = study.Settings
-        raise TypeError(f"settings must be {kind.__module__}.Settings, got {type(settings).__name__}")
+        raise TypeError(
+            f"settings must be {kind.__module__}.Settings, got {type(settings).__name__}"
+        )
     timed = Timed(progress or silent)
     found: Measured = study.measure(settings, timed, pieces)
     found.seconds = timed.seconds

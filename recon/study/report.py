@@ -1,8 +1,10 @@
-"""What every study leaves behind: ``report.json``, ``report.md``, ``report.html`` and figures, each written whole.
+"""What every study leaves behind: ``report.json``, ``report.md``, ``report.html`` and figures, each
+written whole.
 
-The text is a template (``templates/NAME.md.j2``, in Jinja's language) filled in from the JSON values, so that it can be
-rendered from a committed ``report.json``. Templates write Markdown tables as they come to mind; :func:`aligned` pads
-them. A word that hinges on a figure is chosen there by the figure's sign.
+The text is a template (``templates/NAME.md.j2``, in Jinja's language) filled in from the JSON
+values, so that it can be rendered from a committed ``report.json``. Templates write Markdown tables
+as they come to mind; :func:`aligned` pads them. A word that hinges on a figure is chosen there by
+the figure's sign.
 """
 
 from __future__ import annotations
@@ -56,7 +58,9 @@ class Check:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values, ``ok`` among them; open ends are None."""
-        ends = {k: v if math.isfinite(v) else None for k, v in (("low", self.low), ("high", self.high))}
+        ends = {
+            k: v if math.isfinite(v) else None for k, v in (("low", self.low), ("high", self.high))
+        }
         return {**vars(self), **ends, "ours": float(self.ours), "ok": self.ok}
 
 
@@ -83,20 +87,35 @@ def render(name: str, data: Mapping[str, Any]) -> str:
 
 
 def aligned(text: str) -> str:
-    """Markdown whose tables are padded so that they read well as plain text; columns but the first to the right."""
+    """Markdown whose tables are padded so that they read well as plain text; columns but the
+    first to the right."""
     return re.sub(r"(?:^\|.*\|$\n?){2,}", lambda m: _padded(m[0]), text, flags=re.MULTILINE)
 
 
 def _padded(table: str) -> str:
     rows = [[c.strip() for c in re.split(r"(?<!\\)\|", line)[1:-1]] for line in table.splitlines()]
-    widths = [max(map(len, column)) for column in zip(*(r for k, r in enumerate(rows) if k != 1), strict=True)]
-    rule = ["|", *((":" if i == 0 else "") + "-" * (w + 1) + (":" if i else "") + "|" for i, w in enumerate(widths))]
+    widths = [
+        max(map(len, column))
+        for column in zip(*(r for k, r in enumerate(rows) if k != 1), strict=True)
+    ]
+    rule = [
+        "|",
+        *(
+            (":" if i == 0 else "") + "-" * (w + 1) + (":" if i else "") + "|"
+            for i, w in enumerate(widths)
+        ),
+    ]
 
     def line(row: Sequence[str]) -> str:
-        cells = (c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True)))
+        cells = (
+            c.ljust(w) if i == 0 else c.rjust(w)
+            for i, (c, w) in enumerate(zip(row, widths, strict=True))
+        )
         return f"| {' | '.join(cells)} |"
 
-    return "\n".join([line(rows[0]), "".join(rule), *map(line, rows[2:])]) + ("\n" if table.endswith("\n") else "")
+    return "\n".join([line(rows[0]), "".join(rule), *map(line, rows[2:])]) + (
+        "\n" if table.endswith("\n") else ""
+    )
 
 
 def _plain(value: Any) -> Any:
@@ -139,9 +158,12 @@ class Report:
         return render(self.screen_template or self.name, json.loads(self.json))
 
     def save(self, folder: str | os.PathLike[str]) -> list[Path]:
-        """Write ``report.json``, ``report.md``, the figures and ``report.html`` into ``folder`` (made if need be).
+        """Write ``report.json``, ``report.md``, the figures and ``report.html`` into ``folder``
+        (made if need be).
 
         Returns:
             The files written.
         """
-        return write_report(folder, f"torchpcct: {self.name}", f"{self.text}\n", self.json, self.figures)
+        return write_report(
+            folder, f"torchpcct: {self.name}", f"{self.text}\n", self.json, self.figures
+        )

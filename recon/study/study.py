@@ -4,16 +4,17 @@ A study is a module (or a package that exports the same names) of :mod:`recon.st
 :mod:`recon.study.registry`, which runs it by its name. It has
 
 * ``Settings(StudySettings)``, a frozen dataclass that validates itself;
-* ``measure(settings, progress=silent, folder=None) -> Measured``, which simulates, reconstructs and measures. It prints
-  nothing and writes nothing, but finished pieces into ``folder`` (:mod:`recon.evaluate.store`), so that an interrupted
-  study goes on;
+* ``measure(settings, progress=silent, folder=None) -> Measured``, which simulates, reconstructs and
+  measures. It prints nothing and writes nothing, but finished pieces into ``folder``
+  (:mod:`recon.evaluate.store`), so that an interrupted study goes on;
 * ``figures(measured)``: file name → picture of the report;
 * ``checks(data)``, where there is something to check: the report's figures beside the paper's;
-* ``templates/NAME.md.j2``: the report's text, a template that :mod:`recon.study.report` fills in from the JSON values
-  of the report and from nothing else. So the text of a committed report can be rendered again from its values.
+* ``templates/NAME.md.j2``: the report's text, a template that :mod:`recon.study.report` fills in
+  from the JSON values of the report and from nothing else. So the text of a committed report can be
+  rendered again from its values.
 
-Noise has one rule in all studies: realisation i draws with the seed ``settings.seed + i``, the same at every dose, in
-every scene and for every method, so that their results can be paired.
+Noise has one rule in all studies: realisation i draws with the seed ``settings.seed + i``, the same
+at every dose, in every scene and for every method, so that their results can be paired.
 """
 
 from __future__ import annotations
@@ -31,10 +32,19 @@ import numpy as np
 import torchpcct
 from torchpcct.validate import whole
 
-__all__ = ["Measured", "Progress", "ProgressBars", "StudySettings", "Timed", "environment", "silent"]
+__all__ = [
+    "Measured",
+    "Progress",
+    "ProgressBars",
+    "StudySettings",
+    "Timed",
+    "environment",
+    "silent",
+]
 
 Progress = Callable[[str, float], None]
-"""Called with the name of a step (after a bar, ``|``, what changes in the meantime) and its finished fraction, 0…1."""
+"""Called with the name of a step (after a bar, ``|``, what changes in the meantime) and its
+finished fraction, 0…1."""
 
 
 def silent(step: str, fraction: float) -> None:
@@ -93,13 +103,16 @@ class StudySettings:
 
     @classmethod
     def of(cls, values: Mapping[str, Any], quick: bool = False) -> Self:
-        """Settings from the values of a report or a command, whose lists are tuples here; what is no field is left out.
+        """Settings from the values of a report or a command, whose lists are tuples here; what is
+        no field is left out.
 
         Args:
             values: by field.
             quick: those of a first look in under a minute where ``values`` has none.
         """
-        given = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if k in cls.names()}
+        given = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if k in cls.names()
+        }
         return cls(**{**(cls.QUICK if quick else {}), **given})
 
     @classmethod
@@ -119,10 +132,12 @@ class StudySettings:
 
 
 class Timed:
-    """Progress that counts the seconds of every step, by the wall: each time until the step that is told next.
+    """Progress that counts the seconds of every step, by the wall: each time until the step that is
+    told next.
 
     Attributes:
-        seconds: step, up to a colon in its name, → seconds, in the order in which the steps came first.
+        seconds: step, up to a colon in its name, → seconds, in the order in which the steps came
+            first.
     """
 
     def __init__(self, progress: Progress) -> None:
@@ -142,7 +157,8 @@ class Measured:
 
     Attributes:
         settings: of the study.
-        data: JSON values by part (NumPy arrays and scalars among them), of which the report is made.
+        data: JSON values by part (NumPy arrays and scalars among them), of which the report is
+            made.
         seen: what its pictures show besides, the study's own.
         seconds: step → seconds.
     """

@@ -1,15 +1,17 @@
-"""Sound scans drawn at random: how many are told that something is wrong with them? Wrong ones: are sizes right?
+"""Sound scans drawn at random: how many are told that something is wrong with them? Wrong ones: are
+sizes right?
 
-    python tests/bench/false_alarms.py [--n 500] [--first 0] [--kind cone] [--method fbp] [--readings 600000]
-    python tests/bench/false_alarms.py --errors [--n 500] [--first 0] [--kind cone]
+    python tests/bench/false_alarms.py [--n 500] [--first 0] [--kind cone] [--method fbp]
+    [--readings 600000] python tests/bench/false_alarms.py --errors [--n 500] [--first 0] [--kind
+    cone]
 
-Without ``--method`` only the checks run that :func:`recon.reconstruct` runs for every method; with it the whole
-reconstruction, and every warning of its report counts. Each alarm is printed with the seed of its scan; ``--seed N``
-looks at one. The exit status is 1 if there is any.
+Without ``--method`` only the checks run that :func:`recon.reconstruct` runs for every method; with
+it the whole reconstruction, and every warning of its report counts. Each alarm is printed with the
+seed of its scan; ``--seed N`` looks at one. The exit status is 1 if there is any.
 
-``--errors`` describes each scan wrongly by a size drawn at random (the centre, the fan angles, the steps between views,
-a roll of the detector) and counts how often the error is found, is named, and lies within what is said after ±, of
-which 95 % should.
+``--errors`` describes each scan wrongly by a size drawn at random (the centre, the fan angles, the
+steps between views, a roll of the detector) and counts how often the error is found, is named, and
+lies within what is said after ±, of which 95 % should.
 """
 
 import argparse
@@ -52,20 +54,26 @@ def alarms(drawn: Drawn, method: str | None = None) -> list[str]:
 
 
 def as_fine_as_cells(drawn: Drawn) -> VolumeGrid:
-    """The grid of a scan in voxels as large as cells at the axis: others cannot hold what the readings say."""
+    """The grid of a scan in voxels as large as cells at the axis: others cannot hold what the
+    readings say."""
     g, grid = drawn.geometry, drawn.grid
     zoom = 1.0 if drawn.kind == "parallel" else g.magnification
     pitch = g.pitch if drawn.kind == "cone" else (g.pitch,)
     cells = (*pitch[:-1], pitch[-1], pitch[-1])
-    shape = tuple(max(1, math.ceil(size * zoom / cell)) for size, cell in zip(grid.extent, cells, strict=True))
-    return VolumeGrid(shape, tuple(size / number for size, number in zip(grid.extent, shape, strict=True)))
+    shape = tuple(
+        max(1, math.ceil(size * zoom / cell)) for size, cell in zip(grid.extent, cells, strict=True)
+    )
+    return VolumeGrid(
+        shape, tuple(size / number for size, number in zip(grid.extent, shape, strict=True))
+    )
 
 
 CAUSES = ("centre", "scale", "step", "roll")
 
 
 def misdescribed(drawn: Drawn, cause: str, size: float) -> tuple[Any, Any]:
-    """Line integrals of a scan and a geometry that is wrong by a size of one cause, as ``geometry_test`` counts it."""
+    """Line integrals of a scan and a geometry that is wrong by a size of one cause, as
+    ``geometry_test`` counts it."""
     g, shone = drawn.geometry, None
     if cause == "roll":  # each row beside its place
         rows = []
@@ -92,20 +100,33 @@ def misdescribed(drawn: Drawn, cause: str, size: float) -> tuple[Any, Any]:
 
 
 def measured(options: argparse.Namespace) -> int:
-    """The table of errors that are found, named and covered; 1 if less than nine of ten sizes lie within their ±."""
+    """The table of errors that are found, named and covered; 1 if less than nine of ten sizes
+    lie within their ±."""
     table = {cause: np.zeros(4, int) for cause in CAUSES}
     for seed in range(options.first, options.first + options.n):
         drawn = draw(seed, kind=options.kind, readings=options.readings)
         rng = np.random.default_rng([seed, 2])
         causes = [
-            c for c in CAUSES if (c != "roll" or drawn.kind == "cone") and (c != "scale" or drawn.kind != "parallel")
+            c
+            for c in CAUSES
+            if (c != "roll" or drawn.kind == "cone") and (c != "scale" or drawn.kind != "parallel")
         ]
         cause = str(rng.choice(causes))
-        low, high = {"centre": (0.2, 2.0), "scale": (0.01, 0.06), "step": (0.003, 0.02), "roll": (0.01, 0.06)}[cause]
+        low, high = {
+            "centre": (0.2, 2.0),
+            "scale": (0.01, 0.06),
+            "step": (0.003, 0.02),
+            "roll": (0.01, 0.06),
+        }[cause]
         size = float(rng.choice((-1, 1)) * rng.uniform(low, high))
         lines, wrong = misdescribed(drawn, cause, size)
         test = geometry_test(lines, wrong)
-        words = {"centre": "rotation centre", "scale": "fan angles", "step": "steps between", "roll": "rolled"}
+        words = {
+            "centre": "rotation centre",
+            "scale": "fan angles",
+            "step": "steps between",
+            "roll": "rolled",
+        }
         named = any(words[cause] in text for text in test.findings)
         covered = named and abs(test.sizes[cause] - size) <= 2.0 * test.errors[cause]
         table[cause] += (1, bool(test.findings), named, covered)
@@ -128,14 +149,20 @@ def main() -> int:
     parser.add_argument("--method", choices=("fbp", "pwls", "mbir"), help="reconstruct with it")
     parser.add_argument("--readings", type=int, default=600_000, help="the most of a scan")
     parser.add_argument(
-        "--errors", action="store_true", help="wrong descriptions instead: are they found and measured?"
+        "--errors",
+        action="store_true",
+        help="wrong descriptions instead: are they found and measured?",
     )
     options = parser.parse_args()
     logging.getLogger("recon").setLevel(logging.ERROR)
     torch.set_num_threads(1)
     if options.errors:
         return measured(options)
-    seeds = [options.seed] if options.seed is not None else range(options.first, options.first + options.n)
+    seeds = (
+        [options.seed]
+        if options.seed is not None
+        else range(options.first, options.first + options.n)
+    )
     drawn_of, alarmed, texts = Counter[str](), Counter[str](), Counter[str]()
     for seed in seeds:
         drawn = draw(seed, kind=options.kind, readings=options.readings)
@@ -144,7 +171,12 @@ def main() -> int:
         if found:
             alarmed[drawn.kind] += 1
             texts.update(text.split(":")[0][:60] for text in found)
-            print(f"{seed} | {drawn.text}", *(f"      {text[:170]}" for text in found), sep="\n", flush=True)
+            print(
+                f"{seed} | {drawn.text}",
+                *(f"      {text[:170]}" for text in found),
+                sep="\n",
+                flush=True,
+            )
     print(f"\n{'kind':10}{'scans':>8}{'alarms':>8}")
     for kind in KINDS:
         print(f"{kind:10}{drawn_of[kind]:8}{alarmed[kind]:8}")

@@ -1,9 +1,10 @@
 """Planted faults: does a test fail for each? ``python tests/bench/mutation.py [NAME …]``
 
-Every entry of ``faults.yaml`` is a fault that a person could make, in one place of the source, and the test that must
-notice. The repository's packages are copied, the fault is planted in the copy, and the test runs on it, in a process
-that is forked after the slow imports. A fault that its test does not notice is printed, and the exit status is 1. First
-every test must pass on the sound copy. What was found is kept in the table, fault by fault.
+Every entry of ``faults.yaml`` is a fault that a person could make, in one place of the source, and
+the test that must notice. The repository's packages are copied, the fault is planted in the copy,
+and the test runs on it, in a process that is forked after the slow imports. A fault that its test
+does not notice is printed, and the exit status is 1. First every test must pass on the sound copy.
+What was found is kept in the table, fault by fault.
 """
 
 import os
@@ -20,7 +21,8 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 TABLE = Path(__file__).with_name("faults.yaml")
 LIMIT_S = 300
 HOW = {1: "fails", 2: "cannot be collected", 124: f"hangs ({LIMIT_S} s)"}
-"""Exit status of pytest → how a fault is noticed: a test failed; an import broke; nothing came back."""
+"""Exit status of pytest → how a fault is noticed: a test failed; an import broke; nothing came
+back."""
 
 
 class Fault(NamedTuple):
@@ -59,7 +61,9 @@ def _run(copy: Path, tests: list[str]) -> int:
         sys.path.insert(0, str(copy))
         import pytest
 
-        os._exit(int(pytest.main(["-n", "0", "-x", "-q", "-p", "no:cacheprovider", "-m", TIER, *tests])))
+        os._exit(
+            int(pytest.main(["-n", "0", "-x", "-q", "-p", "no:cacheprovider", "-m", TIER, *tests]))
+        )
     end = time.monotonic() + LIMIT_S * len(tests)
     while time.monotonic() < end:
         done, status = os.waitpid(child, os.WNOHANG)
@@ -74,7 +78,9 @@ def _run(copy: Path, tests: list[str]) -> int:
 def _keep(fault: Fault, found: str) -> None:
     """Put the finding of a fault into the table."""
     rows = [f._asdict() | ({"then": found} if f.name == fault.name else {}) for f in read_faults()]
-    TABLE.write_text(yaml.safe_dump(rows, sort_keys=False, allow_unicode=True, width=10_000), encoding="utf-8")
+    TABLE.write_text(
+        yaml.safe_dump(rows, sort_keys=False, allow_unicode=True, width=10_000), encoding="utf-8"
+    )
 
 
 def main(names: list[str]) -> int:
@@ -103,7 +109,10 @@ def main(names: list[str]) -> int:
             path = copy / fault.file
             good = path.read_text(encoding="utf-8")
             if good.count(fault.old) != 1:
-                print(f"{fault.name}: {fault.file} holds {fault.old!r} {good.count(fault.old)} times, not once")
+                print(
+                    f"{fault.name}: {fault.file} holds {fault.old!r} {good.count(fault.old)} "
+                    "times, not once"
+                )
                 missed.append(fault)
                 continue
             before = path.stat()
@@ -113,7 +122,10 @@ def main(names: list[str]) -> int:
             os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
             for stale in (copy / fault.file).parent.glob(f"__pycache__/{path.stem}.cpython-*.pyc"):
                 stale.unlink()
-            print(f"{'caught' if status in HOW else 'MISSED'}  {fault.name:<36} {fault.test}", flush=True)
+            print(
+                f"{'caught' if status in HOW else 'MISSED'}  {fault.name:<36} {fault.test}",
+                flush=True,
+            )
             _keep(fault, HOW.get(status, "MISSED"))
             if status not in HOW:
                 missed.append(fault)

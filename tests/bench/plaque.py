@@ -1,15 +1,19 @@
-"""Readings of the paper's plaque from noisy scans: bias, spread, coverage, presence, beside FBP over the same regions.
+"""Readings of the paper's plaque from noisy scans: bias, spread, coverage, presence, beside FBP
+over the same regions.
 
-    python tests/bench/plaque.py [--n 48] [--work out/bench-plaque] [--out notebooks/plaque] [--mbir] [--summary]
+    python tests/bench/plaque.py [--n 48] [--work out/bench-plaque] [--out notebooks/plaque]
+    [--mbir] [--summary]
 
-Every draw is a noisy scan of the paper's scene (1968 views, drawn readings), read blind or from a point that misses the
-core's centre by 0.4 mm (standard deviation, each axis); the scene without its core is read blind. FBP is that of the
-same readings. A calcification, half the contrast and two cores are scans of analytic bodies, too. Texture, soft edges
-and the held-out plaques of training (``train.scenes.held_out``) are painted on voxels of half the reader's size and
-projected exactly; their noise is drawn by the operator. Finished draws in the work folder are
-kept: after an interruption the same command goes on; ``--summary`` tells what there is, ``--mbir`` reads MBIR of the
-package's weights over the regions of the finished draws. True values are those of rods of each tissue at the plaque's
-place (least squares on noise-free readings), areas and volumes those of the scene.
+Every draw is a noisy scan of the paper's scene (1968 views, drawn readings), read blind or from a
+point that misses the core's centre by 0.4 mm (standard deviation, each axis); the scene without its
+core is read blind. FBP is that of the same readings. A calcification, half the contrast and two
+cores are scans of analytic bodies, too. Texture, soft edges and the held-out plaques of training
+(``train.scenes.held_out``) are painted on voxels of half the reader's size and projected exactly;
+their noise is drawn by the operator. Finished draws in the work folder are kept: after an
+interruption the same command goes on; ``--summary`` tells what there is, ``--mbir`` reads MBIR of
+the package's weights over the regions of the finished draws. True values are those of rods of each
+tissue at the plaque's place (least squares on noise-free readings), areas and volumes those of the
+scene.
 """
 
 import argparse
@@ -47,7 +51,8 @@ from train.scenes.held_out import held_out_plaques
 
 @dataclass(frozen=True)
 class Case:
-    """What is drawn: scene, exposure in s, whether a reader's point is given, and of how many draws one is read."""
+    """What is drawn: scene, exposure in s, whether a reader's point is given, and of how many
+    draws one is read."""
 
     scene: str
     exposure_s: float
@@ -73,20 +78,30 @@ CASES = {
 SCANNED = ("paper", "absent_core", "calcification", "half_contrast", "two cores", "one core")
 POINT_SD_MM = 0.4
 TISSUES_HU = {**ROD_HU, "contrast": ROD_HU["fibrous"] - ROD_HU["core"]}
-"""By rods of 4 mm. Least squares over the plaque's true outlines gives the lumen 478.8 HU on voxels of 0.05 mm, 479.9
-on 0.1 mm and 484.9 on 0.2 mm, where each voxel's mean is averaged once more by the projector."""
-TEXTURE_HU, TEXTURE_MM, SOFT_MM = 10.0, 0.3, 0.12
-_FINER, _POINTS = 2, 3
-"""Voxels of a painting along each edge of one of the reader's, and points along each edge of one of those."""
+"""By rods of 4 mm. Least squares over the plaque's true outlines gives the lumen 478.8 HU on voxels
+of 0.05 mm, 479.9 on 0.1 mm and 484.9 on 0.2 mm, where each voxel's mean is averaged once more by
+the projector."""
+TEXTURE_HU = 10.0
+TEXTURE_MM = 0.3
+SOFT_MM = 0.12
+_FINER = 2
+_POINTS = 3
+"""Voxels of a painting along each edge of one of the reader's, and points along each edge of one
+of those."""
 PLAQUE_ONLY = ("core", "contrast", "core volume", "cap thickness")
 
 
 def truth(plaque: Plaque, **changed: float) -> dict[str, float]:
     """Of every figure, in its unit."""
     volume = 4 / 3 * np.pi * float(np.prod(plaque.core.semi_axes))
-    return {**TISSUES_HU, "wall thickness": plaque.wall_thickness,
-            "lumen area": float(plaque.area("lumen", plaque.core_center[2])), "core volume": volume,
-            "cap thickness": plaque.minimum_cap, **changed}  # fmt: skip
+    return {
+        **TISSUES_HU,
+        "wall thickness": plaque.wall_thickness,
+        "lumen area": float(plaque.area("lumen", plaque.core_center[2])),
+        "core volume": volume,
+        "cap thickness": plaque.minimum_cap,
+        **changed,
+    }
 
 
 def scene_of(name: str) -> tuple[Scene, Plaque]:
@@ -127,23 +142,33 @@ class Draws:
         if name not in self._clean:
             path = None if self.scans is None else self.scans / f"{_stem(name)}_1968.h5"
             known = path is not None and path.exists()
-            self._clean[name] = Scan.load(path) if known else acquire(
-                scene_of(name)[0], presets.pcct(), region=self.grid
-            )  # fmt: skip
+            self._clean[name] = (
+                Scan.load(path)
+                if known
+                else acquire(scene_of(name)[0], presets.pcct(), region=self.grid)
+            )
         return self._clean[name]
 
     @property
     def fine(self) -> VolumeGrid:
         """Of what is painted."""
-        return VolumeGrid(tuple(_FINER * n for n in self.grid.shape), tuple(s / _FINER for s in self.grid.spacing),
-                          self.grid.center)  # fmt: skip
+        return VolumeGrid(
+            tuple(_FINER * n for n in self.grid.shape),
+            tuple(s / _FINER for s in self.grid.spacing),
+            self.grid.center,
+        )
 
-    def drawn(self, name: str, exposure_s: float, k: int) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Statistic AᵀW y and soft FBP of a noisy scan; of what is drawn through the operator, no FBP."""
+    def drawn(
+        self, name: str, exposure_s: float, k: int
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Statistic AᵀW y and soft FBP of a noisy scan; of what is drawn through the operator,
+        no FBP."""
         path = self.work / "statistics" / f"{name.replace(' ', '_')}_{exposure_s:g}s_{k}.npz"
         if path.exists():
             with np.load(path) as kept:
-                return torch.from_numpy(kept["b"]), torch.from_numpy(kept["fbp"]) if "fbp" in kept else None
+                return torch.from_numpy(kept["b"]), torch.from_numpy(
+                    kept["fbp"]
+                ) if "fbp" in kept else None
         if name in SCANNED:
             scan = self.clean(name).with_noise(exposure_s, k)
             found = {"b": self.problem.statistic(scan).b.numpy()}
@@ -162,7 +187,9 @@ class Draws:
             found = {"b": b.numpy()}
         with atomic_write(path) as part, part.open("wb") as file:
             np.savez(file, **found)
-        return torch.from_numpy(found["b"]), torch.from_numpy(found["fbp"]) if "fbp" in found else None
+        return torch.from_numpy(found["b"]), torch.from_numpy(
+            found["fbp"]
+        ) if "fbp" in found else None
 
     def read(self, case: str, k: int) -> None:
         """One reading, unless it is on disk."""
@@ -179,7 +206,11 @@ class Draws:
             _, centre, true = self._held_out(k)
         elif what.scene == "half_contrast":
             true = truth(plaque, contrast=31.08, core=72.14)
-        point = centre + POINT_SD_MM * np.random.default_rng(k).standard_normal(3) if what.pointed else None
+        point = (
+            centre + POINT_SD_MM * np.random.default_rng(k).standard_normal(3)
+            if what.pointed
+            else None
+        )
         start, cpu = time.perf_counter(), time.process_time()
         try:
             reading = read_plaque(data, point, point_sd=POINT_SD_MM, seed=k)
@@ -188,7 +219,9 @@ class Draws:
         else:
             found = {
                 "presence": reading.presence,
-                "figures": {n: asdict(e) for n, e in {**reading.figures, **reading.given_core}.items()},
+                "figures": {
+                    n: asdict(e) for n, e in {**reading.figures, **reading.given_core}.items()
+                },
                 "truth": true,
                 "calcifications": reading.calcifications,
                 "mean_contrast": reading.mean_contrast,
@@ -230,45 +263,79 @@ class Draws:
 
     def _held_out(self, k: int) -> tuple[torch.Tensor, Any, dict[str, float]]:
         """The k-th plaque of the family, its core's centre and true values."""
-        scenes = held_out_plaques(self.fine.shape, self.fine.spacing[0], seed=k // 8, contrasts=(-60.0,))
-        image, core, vessel = scenes.image[k % 8, 0], scenes.core[k % 8].double(), scenes.scenes[k % 8].vessels[0]
+        scenes = held_out_plaques(
+            self.fine.shape, self.fine.spacing[0], seed=k // 8, contrasts=(-60.0,)
+        )
+        image, core, vessel = (
+            scenes.image[k % 8, 0],
+            scenes.core[k % 8].double(),
+            scenes.scenes[k % 8].vessels[0],
+        )
         axes = [torch.from_numpy(a) for a in self.fine.axes]
         total = float(core.sum())
-        centre = [float((core.sum([i for i in range(3) if i != d]) * axes[d]).sum()) / total for d in range(3)]
-        true = {"fat": scenes.scenes[k % 8].background, "wall": vessel.wall_hu, "fibrous": vessel.fibrous_hu,
-                "lumen": vessel.lumen_hu, "core": vessel.fibrous_hu - 60.0, "contrast": 60.0,
-                "wall thickness": vessel.wall, "lumen area": np.pi * vessel.at(0.0)[-2:].prod(),
-                "core volume": total * float(np.prod(self.fine.spacing))}  # fmt: skip
+        centre = [
+            float((core.sum([i for i in range(3) if i != d]) * axes[d]).sum()) / total
+            for d in range(3)
+        ]
+        true = {
+            "fat": scenes.scenes[k % 8].background,
+            "wall": vessel.wall_hu,
+            "fibrous": vessel.fibrous_hu,
+            "lumen": vessel.lumen_hu,
+            "core": vessel.fibrous_hu - 60.0,
+            "contrast": 60.0,
+            "wall thickness": vessel.wall,
+            "lumen area": np.pi * vessel.at(0.0)[-2:].prod(),
+            "core volume": total * float(np.prod(self.fine.spacing)),
+        }
         return image, np.array(centre), true
 
     def _image(self, name: str, k: int) -> torch.Tensor:
         """The paper's plaque with what the model does not have, HU on the fine grid."""
         if not self._tissues:
             scene, _ = plaque_scene()
-            points = VolumeGrid(tuple(_POINTS * n for n in self.fine.shape),
-                                tuple(s / _POINTS for s in self.fine.spacing), self.fine.center)  # fmt: skip
+            points = VolumeGrid(
+                tuple(_POINTS * n for n in self.fine.shape),
+                tuple(s / _POINTS for s in self.fine.spacing),
+                self.fine.center,
+            )
             labels = np.asarray(scene.labels(points))
             values = np.full(labels.shape, TISSUES_HU["fat"], np.float32)
             for tissue in ("wall", "fibrous", "lumen", "core"):
                 values[labels == scene.index(tissue)] = TISSUES_HU[tissue]
-            soft = ndimage.gaussian_filter(values, [SOFT_MM / s for s in points.spacing], mode="nearest")
-            tissue = np.isin(labels, [scene.index(name) for name in ("wall", "fibrous", "core")]).astype(np.float32)
+            soft = ndimage.gaussian_filter(
+                values, [SOFT_MM / s for s in points.spacing], mode="nearest"
+            )
+            tissue = np.isin(
+                labels, [scene.index(name) for name in ("wall", "fibrous", "core")]
+            ).astype(np.float32)
             shape = [n for size in self.fine.shape for n in (size, _POINTS)]
-            self._tissues = {n: torch.from_numpy(v.reshape(shape).mean((1, 3, 5))).float() for n, v in
-                             {"soft edges": soft, "texture": values, "tissue": tissue}.items()}  # fmt: skip
+            self._tissues = {
+                n: torch.from_numpy(v.reshape(shape).mean((1, 3, 5))).float()
+                for n, v in {"soft edges": soft, "texture": values, "tissue": tissue}.items()
+            }
         if name != "texture":
             return self._tissues[name]
         sd = [TEXTURE_MM / np.sqrt(2) / s for s in self.fine.spacing]
-        rough = ndimage.gaussian_filter(np.random.default_rng(k).standard_normal(self.fine.shape), sd, mode="wrap")
+        rough = ndimage.gaussian_filter(
+            np.random.default_rng(k).standard_normal(self.fine.shape), sd, mode="wrap"
+        )
         rough *= TEXTURE_HU / rough.std()
-        return (self._tissues["texture"] + torch.from_numpy(rough) * self._tissues["tissue"]).float()
+        return (
+            self._tissues["texture"] + torch.from_numpy(rough) * self._tissues["tissue"]
+        ).float()
 
 
 def _thresholds(fbp: torch.Tensor, grid: VolumeGrid, lumen: Any, core: Any) -> dict[str, float]:
     """Lumen area and cap by thresholds on the middle slice, the true centres given."""
-    image, plane = fbp[grid.shape[0] // 2], VolumeGrid(grid.shape[1:], grid.spacing[1:], grid.center[1:])
-    return {"lumen area": lumen_area(image, plane, tuple(lumen[1:])),
-            "cap thickness": cap_on_line(image, plane, tuple(lumen[1:]), tuple(core[1:]))}  # fmt: skip
+    image, plane = (
+        fbp[grid.shape[0] // 2],
+        VolumeGrid(grid.shape[1:], grid.spacing[1:], grid.center[1:]),
+    )
+    return {
+        "lumen area": lumen_area(image, plane, tuple(lumen[1:])),
+        "cap thickness": cap_on_line(image, plane, tuple(lumen[1:]), tuple(core[1:])),
+    }
 
 
 def _stem(case: str) -> str:
@@ -279,7 +346,10 @@ def summary(work: Path) -> dict[str, Any]:
     """Figures of all finished draws."""
     cases = {}
     for case, what in CASES.items():
-        draws = [json.loads(p.read_text(encoding="utf-8")) for p in sorted(work.glob(f"{_stem(case)}_*.json"))]
+        draws = [
+            json.loads(p.read_text(encoding="utf-8"))
+            for p in sorted(work.glob(f"{_stem(case)}_*.json"))
+        ]
         read = [d for d in draws if "presence" in d]
         if not read:
             continue
@@ -309,13 +379,21 @@ def summary(work: Path) -> dict[str, Any]:
             exact = np.array([d["truth"][name] for d in read])
             values = np.array([d["figures"][name]["value"] for d in read])
             inside = sum(
-                d["figures"][name]["low"] <= t <= d["figures"][name]["high"] for d, t in zip(read, exact, strict=True)
+                d["figures"][name]["low"] <= t <= d["figures"][name]["high"]
+                for d, t in zip(read, exact, strict=True)
             )
             told = float(np.mean([d["figures"][name]["sd"] for d in read]))
-            entry["figures"][name] = _spread(values, exact) | {"coverage": _share(inside, len(read)), "told_sd": told}
+            entry["figures"][name] = _spread(values, exact) | {
+                "coverage": _share(inside, len(read)),
+                "told_sd": told,
+            }
             for other in ("fbp", "mbir", "fbp_thresholds"):
-                pairs = [(d.get(other, {}).get(name, np.nan), t) for d, t in zip(read, exact, strict=True)]
-                beside = [pair for pair in pairs if np.isfinite(pair[0])]  # thresholds can lose the edges
+                pairs = [
+                    (d.get(other, {}).get(name, np.nan), t)
+                    for d, t in zip(read, exact, strict=True)
+                ]
+                # thresholds can lose the edges
+                beside = [pair for pair in pairs if np.isfinite(pair[0])]
                 if len(beside) > 1:
                     entry["figures"][name][other] = _spread(*np.array(beside).T)
         contrast = np.array([d["figures"]["contrast"]["value"] for d in read])
@@ -323,11 +401,20 @@ def summary(work: Path) -> dict[str, Any]:
             entry["contrast_if_there"] = float(contrast.mean())
         else:
             # What a user is given: the contrast of the claimed cores.
-            given = np.array([d["figures"]["contrast"]["value"] - d["truth"]["contrast"] for d in read if _given(d)])
+            given = np.array(
+                [
+                    d["figures"]["contrast"]["value"] - d["truth"]["contrast"]
+                    for d in read
+                    if _given(d)
+                ]
+            )
             covered = sum(
-                d["figures"]["contrast"]["low"] <= d["truth"]["contrast"] <= d["figures"]["contrast"]["high"]
-                for d in read if _given(d)
-            )  # fmt: skip
+                d["figures"]["contrast"]["low"]
+                <= d["truth"]["contrast"]
+                <= d["figures"]["contrast"]["high"]
+                for d in read
+                if _given(d)
+            )
             entry["given"] = {
                 "n": len(given),
                 "covered": covered,
@@ -336,7 +423,9 @@ def summary(work: Path) -> dict[str, Any]:
             }
         cases[_stem(case)] = entry
     for case, what in CASES.items():
-        absent = _stem(f"{what.exposure_s:.1f} s, no core, {'with a point' if what.pointed else 'blind'}")
+        absent = _stem(
+            f"{what.exposure_s:.1f} s, no core, {'with a point' if what.pointed else 'blind'}"
+        )
         if what.scene == "paper" and absent in cases and _stem(case) in cases:
             contrast = cases[_stem(case)]["figures"]["contrast"]
             slope = (contrast["mean"] - cases[absent]["contrast_if_there"]) / contrast["true"]
@@ -360,38 +449,60 @@ def _share(found: int, n: int) -> dict[str, float]:
 def _spread(values: Any, true: Any) -> dict[str, Any]:
     """Mean, bias, standard deviation of the error with its 95 % interval, RMSE."""
     n, sd = len(values), float((values - true).std(ddof=1)) if len(values) > 1 else float("nan")
-    low, high = (sd * float(np.sqrt((n - 1) / chi2.ppf(q, n - 1))) if n > 1 else float("nan") for q in (0.975, 0.025))
-    return {"true": float(true.mean()), "mean": float(values.mean()), "bias": float((values - true).mean()), "sd": sd,
-            "sd_low": low, "sd_high": high, "rmse": float(np.sqrt(np.mean((values - true) ** 2)))}  # fmt: skip
+    low, high = (
+        sd * float(np.sqrt((n - 1) / chi2.ppf(q, n - 1))) if n > 1 else float("nan")
+        for q in (0.975, 0.025)
+    )
+    return {
+        "true": float(true.mean()),
+        "mean": float(values.mean()),
+        "bias": float((values - true).mean()),
+        "sd": sd,
+        "sd_low": low,
+        "sd_high": high,
+        "rmse": float(np.sqrt(np.mean((values - true) ** 2))),
+    }
 
 
 def _contrast(entry: dict[str, Any]) -> str:
     """What a user is given of the contrast, and how much of a true one is read."""
     if "given" not in entry:
-        return (f"Contrast if there were one: {entry['contrast_if_there']:+.1f} HU; over a core that is there and one "
-                f"that is not: {entry['mean_contrast']:+.1f} HU.")  # fmt: skip
+        return (
+            f"Contrast if there were one: {entry['contrast_if_there']:+.1f} HU; over a core that "
+            "is there and one "
+            f"that is not: {entry['mean_contrast']:+.1f} HU."
+        )
     told = "No contrast given."
     if entry["given"]["n"]:
         told = (
-            "Contrast given: {n} times, bias {bias:+.1f}, RMSE {rmse:.1f} HU, in its interval {covered} times.".format(
-                **entry["given"]
-            )
-        )
+            "Contrast given: {n} times, bias {bias:+.1f}, RMSE {rmse:.1f} HU, in its interval "
+            "{covered} times."
+        ).format(**entry["given"])
     contrast = entry["figures"]["contrast"]
     told += " Of all draws, over a core that is there and one that is not: bias {:+.1f} HU.".format(
         entry["mean_contrast"] - contrast["true"]
     )
     if "slope" in contrast:
-        told += " From no core to all of it: slope {slope:.2f}, SD at slope 1 {corrected_sd:.1f} HU.".format(**contrast)
+        told += (
+            " From no core to all of it: slope {slope:.2f}, SD at slope 1 {corrected_sd:.1f} HU."
+        ).format(**contrast)
     return told
 
 
 def text(result: dict[str, Any]) -> str:
     """Markdown."""
-    lines = ["# Reading the paper's plaque by its tissues", "", f"`{result['command']}`", "",
-             "Bias and SD of the posterior mean over the draws; coverage: of the 95 % intervals; told: mean posterior "
-             "SD. Beside them what other volumes of the same scans read over the same regions, and by thresholds "
-             "(FBP, middle slice, true centres given).", ""]  # fmt: skip
+    lines = [
+        "# Reading the paper's plaque by its tissues",
+        "",
+        f"`{result['command']}`",
+        "",
+        "Bias and SD of the posterior mean over the draws; coverage: of the 95 % intervals; told: "
+        "mean posterior "
+        "SD. Beside them what other volumes of the same scans read over the same regions, and by "
+        "thresholds "
+        "(FBP, middle slice, true centres given).",
+        "",
+    ]
     for entry in result["cases"].values():
         share = entry["claimed_share"]
         lines += [
@@ -403,32 +514,42 @@ def text(result: dict[str, Any]) -> str:
             f"not read {entry['failed']}; "
             f"calcified {entry['calcified']}; a second core {entry['second_core']}; "
             f"warned {entry['warned']}; residual {entry['chi2']:.3f}; texture "
-            f"{entry['texture_hu']:.1f} HU; {entry['cpu_seconds']:.1f} CPU s a reading (loaded machine). "
+            f"{entry['texture_hu']:.1f} HU; {entry['cpu_seconds']:.1f} CPU s a reading (loaded "
+            "machine). "
             f"{_contrast(entry)}",
             "",
-            "| | true | mean | bias | SD [95 %] | told | RMSE | coverage | soft FBP: mean, SD | MBIR: mean, SD | "
+            "| | true | mean | bias | SD [95 %] | told | RMSE | coverage | soft FBP: mean, SD | "
+            "MBIR: mean, SD | "
             "FBP by thresholds: bias, RMSE |",
             "|---" * 11 + "|",
         ]
         for name, f in entry["figures"].items():
             d = 1 if abs(f["true"]) > 20 else 2
-            cells = [f"{f['true']:.{d}f}", f"{f['mean']:.{d}f}", f"{f['bias']:+.{d}f}",
-                     f"{f['sd']:.{d}f} [{f['sd_low']:.{d}f}, {f['sd_high']:.{d}f}]", f"{f['told_sd']:.{d}f}",
-                     f"{f['rmse']:.{d}f}",
-                     "{value:.2f} [{low:.2f}, {high:.2f}]".format(**f["coverage"])]  # fmt: skip
+            cells = [
+                f"{f['true']:.{d}f}",
+                f"{f['mean']:.{d}f}",
+                f"{f['bias']:+.{d}f}",
+                f"{f['sd']:.{d}f} [{f['sd_low']:.{d}f}, {f['sd_high']:.{d}f}]",
+                f"{f['told_sd']:.{d}f}",
+                f"{f['rmse']:.{d}f}",
+                "{value:.2f} [{low:.2f}, {high:.2f}]".format(**f["coverage"]),
+            ]
             for other, keys in (
                 ("fbp", ("mean", "sd")),
                 ("mbir", ("mean", "sd")),
                 ("fbp_thresholds", ("bias", "rmse")),
             ):
-                cells.append(", ".join(f"{f[other][key]:.{d}f}" for key in keys) if other in f else "–")
+                cells.append(
+                    ", ".join(f"{f[other][key]:.{d}f}" for key in keys) if other in f else "–"
+                )
             lines.append(f"| {name} | " + " | ".join(cells) + " |")
         lines.append("")
     return "\n".join(lines)
 
 
 def picture(result: dict[str, Any]) -> Any:
-    """Error of the contrast, by case: mean and standard deviation of the readings and of FBP over the same regions."""
+    """Error of the contrast, by case: mean and standard deviation of the readings and of FBP
+    over the same regions."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 5), layout="constrained")
@@ -436,16 +557,33 @@ def picture(result: dict[str, Any]) -> Any:
     cases = [c for c in result["cases"].values() if "contrast" in c["figures"]]
     for row, entry in enumerate(cases):
         f = entry["figures"]["contrast"]
-        for shift, key, colour in ((0.0, None, "tab:blue"), (0.2, "fbp", "tab:orange"), (0.4, "mbir", "tab:green")):
+        for shift, key, colour in (
+            (0.0, None, "tab:blue"),
+            (0.2, "fbp", "tab:orange"),
+            (0.4, "mbir", "tab:green"),
+        ):
             g = f if key is None else f.get(key)
             if g is not None:
-                axes[0].errorbar(g["bias"], row + shift, xerr=g["sd"], fmt="o", color=colour, capsize=3)
+                axes[0].errorbar(
+                    g["bias"], row + shift, xerr=g["sd"], fmt="o", color=colour, capsize=3
+                )
         cover = f["coverage"]
-        axes[1].errorbar(cover["value"], row, fmt="o", color="tab:blue", capsize=3,
-                         xerr=[[cover["value"] - cover["low"]], [cover["high"] - cover["value"]]])  # fmt: skip
-    for colour, name in (("tab:blue", "tissues as unknowns"), ("tab:orange", "soft FBP, same regions"),
-                         ("tab:green", "MBIR, same regions")):  # fmt: skip
-        if name.startswith(("tissues", "soft")) or any("mbir" in c["figures"]["contrast"] for c in cases):
+        axes[1].errorbar(
+            cover["value"],
+            row,
+            fmt="o",
+            color="tab:blue",
+            capsize=3,
+            xerr=[[cover["value"] - cover["low"]], [cover["high"] - cover["value"]]],
+        )
+    for colour, name in (
+        ("tab:blue", "tissues as unknowns"),
+        ("tab:orange", "soft FBP, same regions"),
+        ("tab:green", "MBIR, same regions"),
+    ):
+        if name.startswith(("tissues", "soft")) or any(
+            "mbir" in c["figures"]["contrast"] for c in cases
+        ):
             axes[0].plot([], [], "o", color=colour, label=name)
     axes[0].axvline(0.0, color="0.6", lw=0.8)
     axes[0].set_yticks(range(len(cases)), [f"{c['case']} ({c['n']})" for c in cases])
@@ -460,13 +598,23 @@ def picture(result: dict[str, Any]) -> Any:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--n", type=int, default=48, help="draws of every case")
-    parser.add_argument("--work", type=Path, default=Path("out/bench-plaque"), help="folder for finished draws")
-    parser.add_argument("--scans", type=Path, help="folder with noise-free scans, to save the simulation")
-    parser.add_argument("--out", type=Path, default=Path("notebooks/plaque"), help="folder for the report")
+    parser.add_argument(
+        "--work", type=Path, default=Path("out/bench-plaque"), help="folder for finished draws"
+    )
+    parser.add_argument(
+        "--scans", type=Path, help="folder with noise-free scans, to save the simulation"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("notebooks/plaque"), help="folder for the report"
+    )
     parser.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES))
-    parser.add_argument("--mbir", action="store_true", help="read MBIR over the regions of finished draws")
+    parser.add_argument(
+        "--mbir", action="store_true", help="read MBIR over the regions of finished draws"
+    )
     parser.add_argument("--summary", action="store_true", help="only tell what is finished")
     options = parser.parse_args()
     (options.work / "statistics").mkdir(parents=True, exist_ok=True)
@@ -481,7 +629,10 @@ def main() -> None:
                 else:
                     draws.beside(case, k, network)
     result = summary(options.work)
-    result |= {"seeds": f"0 … {options.n - 1}, the same of scan, point and Monte Carlo", "torch": torch.__version__}
+    result |= {
+        "seeds": f"0 … {options.n - 1}, the same of scan, point and Monte Carlo",
+        "torch": torch.__version__,
+    }
     write_results(options.out, "report", result, text(result))
     with atomic_write(options.out / "plaque.png") as part:
         picture(result).savefig(part, dpi=120)

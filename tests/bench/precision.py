@@ -1,12 +1,14 @@
-"""Float32 against float64: every operator and method against problem size, and numbers that are hard on float32.
+"""Float32 against float64: every operator and method against problem size, and numbers that are
+hard on float32.
 
     python tests/bench/precision.py [--largest 256] [--keep]
 
-``table``: the same float32 input through both precisions; ``rms`` and ``worst`` are the difference over the rms of the
-float64 result, of the methods in HU. ``hard``: sums of 1e8 terms, subnormals and 1e30, cancellation in the logarithm,
-footprints near 45°, weights that are nearly zero, singular bins, an observer with too few samples, solvers from zero,
-noise and 10⁴ HU. With ``--keep`` the figures go to ``precision.json`` and ``precision.md`` beside this file; the small
-ones hardly depend on the processor and are pinned by ``tests/test_precision.py``.
+``table``: the same float32 input through both precisions; ``rms`` and ``worst`` are the difference
+over the rms of the float64 result, of the methods in HU. ``hard``: sums of 1e8 terms, subnormals
+and 1e30, cancellation in the logarithm, footprints near 45°, weights that are nearly zero, singular
+bins, an observer with too few samples, solvers from zero, noise and 10⁴ HU. With ``--keep`` the
+figures go to ``precision.json`` and ``precision.md`` beside this file; the small ones hardly depend
+on the processor and are pinned by ``tests/test_precision.py``.
 """
 
 import argparse
@@ -47,7 +49,9 @@ def setup(beam: str, n: int) -> tuple[Any, VolumeGrid]:
     if beam == "parallel":
         return ParallelBeam(np.arange(n) * math.pi / n, columns, VOXEL), VolumeGrid((n, n), VOXEL)
     if beam == "fan":
-        return FanBeam(full_turn(n), 3 * size, 5 * size, columns, 1.7 * VOXEL), VolumeGrid((n, n), VOXEL)
+        return FanBeam(full_turn(n), 3 * size, 5 * size, columns, 1.7 * VOXEL), VolumeGrid(
+            (n, n), VOXEL
+        )
     cone = ConeBeam(full_turn(n), 3 * size, 5 * size, columns, rows, 1.7 * VOXEL)
     return cone, VolumeGrid((n // 2, n, n), VOXEL)
 
@@ -68,7 +72,8 @@ def noise(shape: Any, seed: int = 0) -> Tensor:
 def body(grid: VolumeGrid) -> Tensor:
     """Water, round, with a texture of 10 %, float32 mm⁻¹."""
     axes = torch.meshgrid(
-        *[torch.from_numpy(a / e) for a, e in zip(grid.axes, grid.extent, strict=True)], indexing="ij"
+        *[torch.from_numpy(a / e) for a, e in zip(grid.axes, grid.extent, strict=True)],
+        indexing="ij",
     )
     inside = sum(a.square() for a in axes[-2:]) < 0.42**2
     return (MU * inside * (1 + 0.1 * noise(grid.shape, 1))).float()
@@ -77,16 +82,25 @@ def body(grid: VolumeGrid) -> Tensor:
 def apart(single: Tensor, double: Tensor) -> Row:
     """Difference over the rms of the float64 result: rms and largest."""
     error, scale = single.double() - double, double.square().mean().sqrt()
-    return {"rms": float(error.square().mean().sqrt() / scale), "worst": float(error.abs().max() / scale)}
+    return {
+        "rms": float(error.square().mean().sqrt() / scale),
+        "worst": float(error.abs().max() / scale),
+    }
 
 
 def both(operator: Callable[[Tensor], Tensor], x: Tensor) -> Row:
     return apart(operator(x), operator(x.double()))
 
 
-def linear(geometry: Any, grid: VolumeGrid, A: Projector, x: Tensor, y: Tensor) -> tuple[tuple[str, Any, Tensor], ...]:
+def linear(
+    geometry: Any, grid: VolumeGrid, A: Projector, x: Tensor, y: Tensor
+) -> tuple[tuple[str, Any, Tensor], ...]:
     """Linear operators of a whole field, and what they are given."""
-    return ("A", A, x), ("Aᵀ", A.T, y), ("FBP", lambda v: fbp(v, geometry, grid, "soft", outside=0.0), y)
+    return (
+        ("A", A, x),
+        ("Aᵀ", A.T, y),
+        ("FBP", lambda v: fbp(v, geometry, grid, "soft", outside=0.0), y),
+    )
 
 
 def operators(beam: str, n: int) -> Iterator[Row]:
@@ -96,7 +110,12 @@ def operators(beam: str, n: int) -> Iterator[Row]:
     x = body(grid)
     y = A(x)
     for name, operator, given in linear(geometry, grid, A, x, y):
-        yield {"what": f"{name}, {beam} beam", "n": n, "unknowns": grid.voxels, **both(operator, given)}
+        yield {
+            "what": f"{name}, {beam} beam",
+            "n": n,
+            "unknowns": grid.voxels,
+            **both(operator, given),
+        }
 
 
 def methods(n: int, tolerance: float = 1e-3) -> Iterator[Row]:
@@ -109,9 +128,14 @@ def methods(n: int, tolerance: float = 1e-3) -> Iterator[Row]:
     yield {"what": "Gram operator", **about, **apart(model(x), exact(x.double()))}
     prior = QGGMRF(0.15, 100.0)
     bound = prior.bind(model.information(HU), grid.spacing, HU)
-    yield {"what": "gradient of the q-GGMRF", **about, **both(lambda v: bound.gradient(v[None])[0], x)}
+    yield {
+        "what": "gradient of the q-GGMRF",
+        **about,
+        **both(lambda v: bound.gradient(v[None])[0], x),
+    }
     found = [
-        pwls(A, v, w, prior, mu_per_hu=HU, gram=g, tolerance=tolerance, max_exact=100).x.double() / HU
+        pwls(A, v, w, prior, mu_per_hu=HU, gram=g, tolerance=tolerance, max_exact=100).x.double()
+        / HU
         for v, w, g in ((y, weights, model), (y.double(), weights.double(), exact))
     ]
     yield {"what": "PWLS, HU", **about, **hu(*found)}
@@ -119,7 +143,9 @@ def methods(n: int, tolerance: float = 1e-3) -> Iterator[Row]:
     b = A.T(weights * y)[None]
     volumes = []
     for gram, dtype in ((model, torch.float32), (exact, torch.float64)):
-        normal = NormalisedProblem.from_statistic(gram, b.to(dtype), torch.ones(1), HU, network.voxel_mm)
+        normal = NormalisedProblem.from_statistic(
+            gram, b.to(dtype), torch.ones(1), HU, network.voxel_mm
+        )
         with torch.no_grad():
             u = network.model.to(dtype)(normal, 0.5)
         volumes.append((u * normal.scale_hu.reshape(-1, 1, 1, 1)).double())
@@ -135,11 +161,16 @@ def sums(terms: int) -> Row:
     """Inner product of equal terms: float32 alone stops growing at 2²⁴ of them."""
     ones = torch.full((terms,), 0.1)
     exact = terms * float(ones[0]) ** 2
-    return {"what": "inner product", "terms": terms, "relative": abs(float(dot(ones, ones, 1)) / exact - 1)}
+    return {
+        "what": "inner product",
+        "terms": terms,
+        "relative": abs(float(dot(ones, ones, 1)) / exact - 1),
+    }
 
 
 def scaled(scale: float, n: int = 32) -> Iterator[Row]:
-    """Linear operators of an input of other magnitude; subnormal float32 as they are, with the few bits they have."""
+    """Linear operators of an input of other magnitude; subnormal float32 as they are, with the
+    few bits they have."""
     geometry, grid = setup("fan", n)
     A = Projector(geometry, grid)
     x = body(grid)
@@ -158,11 +189,17 @@ def logarithm(air: float) -> Row:
     half = torch.log(torch.tensor(air, dtype=torch.float64)) - torch.log(counts.double() + 0.5)
     error = (scan.line_integrals().double().flatten() - half).abs()
     in_noise = float((error * counts.double().sqrt()).max())
-    return {"what": "−ln(counts / air)", "air": air, "worst": float(error.max()), "in_noise": in_noise}
+    return {
+        "what": "−ln(counts / air)",
+        "air": air,
+        "worst": float(error.max()),
+        "in_noise": in_noise,
+    }
 
 
 def diagonal(beside: float, n: int = 64) -> Row:
-    """Views at 45° and so much beside it, rad: where rows and columns of the grid change their parts."""
+    """Views at 45° and so much beside it, rad: where rows and columns of the grid change their
+    parts."""
     angles = [math.pi / 4 + k * math.pi / 2 + beside for k in range(4)]
     geometry = ParallelBeam(angles, math.ceil(1.5 * n), VOXEL)
     A = Projector(geometry, VolumeGrid((n, n), VOXEL))
@@ -173,7 +210,8 @@ def diagonal(beside: float, n: int = 64) -> Row:
 
 
 def light_weights(share: float, n: int = 8) -> Row:
-    """PWLS where a third of the readings weigh nearly nothing and hold nonsense, against weights of 0."""
+    """PWLS where a third of the readings weigh nearly nothing and hold nonsense, against weights
+    of 0."""
     A, weights, grid = inset(n)
     y = A(body(grid)) + noise(A.range_shape, 4) / weights.sqrt()
     third = torch.arange(weights.shape[-1]) % 3 == 0
@@ -182,7 +220,9 @@ def light_weights(share: float, n: int = 8) -> Row:
     for factor in (share, 0.0):
         w = torch.where(third, weights * factor, weights)
         data = torch.where(third, y + 1.0, y)
-        found.append(pwls(A, data, w, prior, mu_per_hu=HU, tolerance=1e-3, max_exact=100).x.double() / HU)
+        found.append(
+            pwls(A, data, w, prior, mu_per_hu=HU, tolerance=1e-3, max_exact=100).x.double() / HU
+        )
     return {"what": "PWLS, nearly zero weights", "share": share, **hu(*found)}
 
 
@@ -195,7 +235,11 @@ def starts(where: str, start: str, n: int = 8) -> Row:
         A = Projector(geometry, grid)
         weights = torch.full(A.range_shape, 1e6)
     y = A(body(grid)) + noise(A.range_shape, 4) / weights.sqrt()
-    first = {"zero": None, "noise": 0.5 * MU * noise(grid.shape, 5), "10⁴ HU": torch.full(grid.shape, 11 * MU)}[start]
+    first = {
+        "zero": None,
+        "noise": 0.5 * MU * noise(grid.shape, 5),
+        "10⁴ HU": torch.full(grid.shape, 11 * MU),
+    }[start]
     exact = pwls(A, y.double(), weights.double(), QGGMRF(0.15, 100.0), mu_per_hu=HU, tolerance=0.01)
     found = pwls(A, y, weights, QGGMRF(0.15, 100.0), mu_per_hu=HU, start=first)
     return {"what": f"PWLS, {where}, from {start}", **hu(found.x.double() / HU, exact.x / HU)}
@@ -211,13 +255,15 @@ def refused(what: str, call: Callable[[], Any]) -> Row:
 
 
 def spectral(second: Any) -> SpectralModel:
-    """Two bins of one column: a falling spectrum, and ``second`` ``(energies,)`` photons above it."""
+    """Two bins of one column: a falling spectrum, and ``second`` ``(energies,)`` photons above
+    it."""
     energies = np.linspace(30.0, 100.0, 36)
     return SpectralModel(energies, np.stack([np.linspace(2e4, 0.0, 36), second])[None])
 
 
 def bins(beside: float) -> Row:
-    """Decomposition by two bins whose spectra differ by so much: exact counts, error in mm and its noise."""
+    """Decomposition by two bins whose spectra differ by so much: exact counts, error in mm and
+    its noise."""
     falling = np.linspace(2e4, 0.0, 36)
     model = spectral((1 - beside) * falling + beside * falling[::-1])
     true = torch.tensor([[200.0], [5.0]], dtype=torch.float64)
@@ -226,11 +272,13 @@ def bins(beside: float) -> Row:
     single = decompose(counts.float(), model, bias_reduction=False, tolerance=1e-7)
     sd = found.covariance[[0, 2]].sqrt()
     return {
-        "what": "decomposition, nearly equal bins", "beside": beside,
+        "what": "decomposition, nearly equal bins",
+        "beside": beside,
         "in_noise": float(((found.line_integrals - true) / sd).abs().max()),
         "in_noise_float32": float(((single.line_integrals.double() - true) / sd).abs().max()),
-        "noise_mm": float(sd.max()), "converged": bool(found.converged.all()),
-    }  # fmt: skip
+        "noise_mm": float(sd.max()),
+        "converged": bool(found.converged.all()),
+    }
 
 
 def hard_refusals() -> Iterator[Row]:
@@ -264,10 +312,16 @@ def hard(terms: int) -> Iterator[Row]:
 
 
 UNITS = {
-    "relative": "relative error", "rms": "rms", "worst": "worst", "in_noise": "worst in SDs of its noise",
-    "in_noise_float32": "the same of float32 counts", "adjoint": "adjoint against forward", "noise_mm": "noise, mm",
-    "converged": "converged", "refused": "refused: “",
-}  # fmt: skip
+    "relative": "relative error",
+    "rms": "rms",
+    "worst": "worst",
+    "in_noise": "worst in SDs of its noise",
+    "in_noise_float32": "the same of float32 counts",
+    "adjoint": "adjoint against forward",
+    "noise_mm": "noise, mm",
+    "converged": "converged",
+    "refused": "refused: “",
+}
 
 
 def report(found: dict[str, Any]) -> str:
@@ -277,35 +331,51 @@ def report(found: dict[str, Any]) -> str:
         "# Float32 against float64",
         "",
         "Written by `python tests/bench/precision.py --keep`, which says what is compared.",
-        "Difference of the two over the rms of the float64 result, of PWLS and MBIR in HU: rms (worst), for planes of",
+        "Difference of the two over the rms of the float64 result, of PWLS and MBIR in HU: rms "
+        "(worst), for planes of",
         "n² and volumes of n²·n/2 voxels.",
         "",
         "| n | " + " | ".join(map(str, sizes)) + " |",
         "|---" * (len(sizes) + 1) + "|",
     ]
     for what in dict.fromkeys(r["what"] for r in found["table"]):
-        cells = {r["n"]: f"{r['rms']:.1e} ({r['worst']:.1e})" for r in found["table"] if r["what"] == what}
+        cells = {
+            r["n"]: f"{r['rms']:.1e} ({r['worst']:.1e})"
+            for r in found["table"]
+            if r["what"] == what
+        }
         lines.append(f"| {what} | " + " | ".join(cells.get(n, "") for n in sizes) + " |")
     lines += ["", "| hard on float32 | of | found |", "|---|---|---|"]
     for row in found["hard"]:
-        of = ", ".join(f"{k} {v:g}" for k, v in row.items() if k in ("terms", "scale", "air", "beside", "share"))
+        of = ", ".join(
+            f"{k} {v:g}"
+            for k, v in row.items()
+            if k in ("terms", "scale", "air", "beside", "share")
+        )
         values = []
         for key, text in UNITS.items():
             if key in row:
                 value = row[key]
                 values.append(
-                    f"{text}{value}”" if key == "refused" else
-                    text if value is True else f"not {text}" if value is False else f"{text} {value:.1e}"
-                )  # fmt: skip
+                    f"{text}{value}”"
+                    if key == "refused"
+                    else text
+                    if value is True
+                    else f"not {text}"
+                    if value is False
+                    else f"{text} {value:.1e}"
+                )
         lines.append(f"| {row['what']} | {of} | {'; '.join(values)} |")
     return "\n".join([*lines, "", NOTES])
 
 
 NOTES = """\
-* A sums along rows and columns first and takes differences then, so its rounding grows with n; Aᵀ's hardly does.
+* A sums along rows and columns first and takes differences then, so its rounding grows with n;
+  Aᵀ's hardly does.
 * FBP's rounding is below 0.01 HU at every size.
 * Below 1e-38 float32 has ever fewer bits (seven at 1e-41 · 0.02), and results are as coarse.
-* The PWLS insets are tiny and starved (noise of 600 HU), which makes rounding count most: 5e-4 of their noise is left.
+* The PWLS insets are tiny and starved (noise of 600 HU), which makes rounding count most: 5e-4 of
+  their noise is left.
 * MBIR's network works in units of the noise: it has no tolerance, and rounding is all that differs.
 * MBIR, joint PWLS and `conjugate_gradient` always start from zero; PWLS alone can be given a start.
 """

@@ -2,10 +2,11 @@
 
     python tests/bench/prior_parts.py RUNS
 
-The weights that ship, whole and with one part left out, are measured on the four held-out vessels that simple filters
-are tuned on (``rival_scenes.py``: along z, tilted, in plane, curved; other diameters, plaques and tissues than the
-paper's), with and without the core, so nothing here was chosen on a scene that a report quotes. Figures are kept
-in the folder RUNS; the same command goes on. It writes ``prior_parts.json`` and ``prior_parts.md`` beside this file.
+The weights that ship, whole and with one part left out, are measured on the four held-out vessels
+that simple filters are tuned on (``rival_scenes.py``: along z, tilted, in plane, curved; other
+diameters, plaques and tissues than the paper's), with and without the core, so nothing here was
+chosen on a scene that a report quotes. Figures are kept in the folder RUNS; the same command goes
+on. It writes ``prior_parts.json`` and ``prior_parts.md`` beside this file.
 """
 
 import argparse
@@ -29,7 +30,9 @@ from recon.mbir.priors import prior_of
 from recon.plaque.layer import LayerField
 
 HERE = Path(__file__).parent
-DOSES, DRAWS, FIRST_DRAW = (0.35, 2.0), 6, 100
+DOSES = (0.35, 2.0)
+DRAWS = 6
+FIRST_DRAW = 100
 MOVED_HU = 150.0
 
 
@@ -54,15 +57,23 @@ USES: dict[str, Callable[[Mbir], Mbir]] = {
     "one orientation of the network instead of eight": _one_orientation,
     "no data consistency at the end": lambda n: Mbir(n.model, final_data_consistency=False),
     "its filtered view in the network's place": lambda n: Mbir(n.model, prior=bilateral_prior),
-    "Perona and Malik's filter in the network's place": lambda n: Mbir(n.model, prior=prior_of("perona-malik")),
+    "Perona and Malik's filter in the network's place": lambda n: Mbir(
+        n.model, prior=prior_of("perona-malik")
+    ),
     "the linear start alone": lambda n: Mbir(n.model, steps=0),
     "around a drawn vessel": OutlineMbir,
     "drawn, what is in the layer correlated over 0.5 mm in every direction": _OneLength,
-    "drawn, eight turns of the network instead of four": lambda n: OutlineMbir(Mbir(n.model, prior=n.model.network)),
+    "drawn, eight turns of the network instead of four": lambda n: OutlineMbir(
+        Mbir(n.model, prior=n.model.network)
+    ),
     "drawn, overshoot not cut off": lambda n: OutlineMbir(Mbir(n.model, cut_overshoot=False)),
     "drawn, nothing put back": lambda n: OutlineMbir(Mbir(n.model, restore=False)),
-    "drawn, no data consistency at the end": lambda n: OutlineMbir(Mbir(n.model, final_data_consistency=False)),
-    "drawn, the filtered view in the network's place": lambda n: OutlineMbir(Mbir(n.model, prior=bilateral_prior)),
+    "drawn, no data consistency at the end": lambda n: OutlineMbir(
+        Mbir(n.model, final_data_consistency=False)
+    ),
+    "drawn, the filtered view in the network's place": lambda n: OutlineMbir(
+        Mbir(n.model, prior=bilateral_prior)
+    ),
     "drawn, Perona and Malik's filter in the network's place": lambda n: OutlineMbir(
         Mbir(n.model, prior=prior_of("perona-malik"))
     ),
@@ -102,10 +113,16 @@ def figures(network: Mbir, bench: Bench) -> dict[str, Any]:
                 "rim": clean[_rim(with_core)].min() - with_core.true.min(),
             }
             rows.append(row)
-        found[f"{dose:g}"] = {k: float(torch.tensor([float(r[k]) for r in rows]).mean()) for k in rows[0]}
+        found[f"{dose:g}"] = {
+            k: float(torch.tensor([float(r[k]) for r in rows]).mean()) for k in rows[0]
+        }
     place = pairs[0][0]
     moved = volume(
-        place.b + bench.problem.gram.apply(torch.full_like(place.b, MOVED_HU) * bench.problem.mu_ref / 1000), 1.0
+        place.b
+        + bench.problem.gram.apply(
+            torch.full_like(place.b, MOVED_HU) * bench.problem.mu_ref / 1000
+        ),
+        1.0,
     )
     still = volume(place.b, 1.0)
     found["moved_hu"] = _square(moved - still - MOVED_HU, place) ** 0.5
@@ -126,15 +143,27 @@ def _rim(place: Place) -> Tensor:
     return near & (place.true <= place.true.min() + 1e-3)
 
 
-COLUMNS = (("error", "error, HU"), ("clean", "without noise"), ("fat", "SD in fat"), ("slope", "slope"),
-           ("sd", "contrast SD at slope 1"), ("rim", "deepest undershoot"))  # fmt: skip
+COLUMNS = (
+    ("error", "error, HU"),
+    ("clean", "without noise"),
+    ("fat", "SD in fat"),
+    ("slope", "slope"),
+    ("sd", "contrast SD at slope 1"),
+    ("rim", "deepest undershoot"),
+)
 
 
 def table(results: dict[str, Any]) -> str:
     """Markdown; every cell 0.35 s / 2.0 s."""
-    lines = ["| | " + " | ".join(t for _, t in COLUMNS) + " | constant added |", "|---" * (len(COLUMNS) + 2) + "|"]
+    lines = [
+        "| | " + " | ".join(t for _, t in COLUMNS) + " | constant added |",
+        "|---" * (len(COLUMNS) + 2) + "|",
+    ]
     for name, r in results.items():
-        cells = [" / ".join(f"{r[f'{d:g}'][k]:.{2 if k == 'slope' else 1}f}" for d in DOSES) for k, _ in COLUMNS]
+        cells = [
+            " / ".join(f"{r[f'{d:g}'][k]:.{2 if k == 'slope' else 1}f}" for d in DOSES)
+            for k, _ in COLUMNS
+        ]
         lines.append(f"| {name} | " + " | ".join(cells) + f" | {r['moved_hu']:.1f} |")
     return "\n".join(lines)
 
@@ -153,11 +182,15 @@ def main() -> None:
             kept.write_text(json.dumps(figures(make(Mbir.load()), bench)), encoding="utf-8")
         results[use] = json.loads(kept.read_text(encoding="utf-8"))
         text = (
-            f"0.35 / 2.0 s; means over four held-out vessels and {DRAWS} noise draws. Undershoot: the darkest fat "
-            "beside the vessel without noise, against the truth. Constant added: change of the volume, HU rms, beside "
+            f"0.35 / 2.0 s; means over four held-out vessels and {DRAWS} noise draws. Undershoot: "
+            "the darkest fat "
+            "beside the vessel without noise, against the truth. Constant added: change of the "
+            "volume, HU rms, beside "
             f"the {MOVED_HU:g} HU that were added to the inset.\n\n{table(results)}\n"
         )
-        (HERE / "prior_parts.md").write_text(f"# What each part of the prior brings\n\n{text}", encoding="utf-8")
+        (HERE / "prior_parts.md").write_text(
+            f"# What each part of the prior brings\n\n{text}", encoding="utf-8"
+        )
         plain = {"draws": DRAWS, "results": results}
         (HERE / "prior_parts.json").write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
         print(f"{time.perf_counter() - began:.0f} s: {use}", flush=True)

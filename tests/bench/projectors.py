@@ -1,11 +1,13 @@
 """Time against error of the projectors, ours and peers, interleaved in one run.
 
-    python tests/bench/projectors.py [--repeats 5] [--out tests/bench/results] [--xcist path/to/libcatsim.so]
+    python tests/bench/projectors.py [--repeats 5] [--out tests/bench/results] [--xcist
+    path/to/libcatsim.so]
 
-Peers take part where they are installed: ASTRA (``pip install astra-toolbox``) and the distance-driven C projector of
-XCIST, from the library that ships in ``gecatsim`` or the one named by ``--xcist``. Both use one core. Errors are
-relative L2 against exact, cell-averaged line integrals. The medians
-depend on what else the machine does; the ratios within a run less: the load average stands above the table.
+Peers take part where they are installed: ASTRA (``pip install astra-toolbox``) and the
+distance-driven C projector of XCIST, from the library that ships in ``gecatsim`` or the one named
+by ``--xcist``. Both use one core. Errors are relative L2 against exact, cell-averaged line
+integrals. The medians depend on what else the machine does; the ratios within a run less: the load
+average stands above the table.
 """
 
 import argparse
@@ -38,9 +40,11 @@ Pass = Callable[[], Any]
 
 
 class Peer(NamedTuple):
-    """One projector on one case: the passes to time, a forward projection to check, and which views it takes.
+    """One projector on one case: the passes to time, a forward projection to check, and which views
+    it takes.
 
-    ``adjoint`` is None where the library has none. Views ``0, every, 2 every, …`` are taken, the times multiplied.
+    ``adjoint`` is None where the library has none. Views ``0, every, 2 every, …`` are taken, the
+    times multiplied.
     """
 
     forward: Pass
@@ -56,8 +60,13 @@ class Case:
         self.name, self.geometry, self.grid, self.window = name, geometry, grid, window
         self.gaussians = bodies or _gaussians(grid)
         self.images = {"gaussians": rasterize(grid, self.gaussians)}
-        # Two rays across a cell are not enough where a body is only a few cells wide, as in the 2-D inset.
-        self.exact = {"gaussians": line_integrals(geometry, self.gaussians, window, 5 if grid.ndim == 2 else 2)}
+        # Two rays across a cell are not enough where a body is only a few cells wide, as in the 2-D
+        # inset.
+        self.exact = {
+            "gaussians": line_integrals(
+                geometry, self.gaussians, window, 5 if grid.ndim == 2 else 2
+            )
+        }
         if grid.ndim == 2:
             ellipses = _ellipses(grid)
             self.images["ellipses"] = rasterize(grid, ellipses, 8)
@@ -93,7 +102,13 @@ def _gaussians(grid: VolumeGrid) -> list[Any]:
 def _ellipses(grid: VolumeGrid) -> list[Any]:
     half = min(grid.extent) / 2
     big = Ellipsoid(tuple(grid.center), (0.9 * half, 0.8 * half), 0.4, 1.0)
-    return [big, *(Ellipsoid(c, tuple(2 * r for r in radii), a, v) for c, radii, a, v in _spread(grid, 2, 6))]
+    return [
+        big,
+        *(
+            Ellipsoid(c, tuple(2 * r for r in radii), a, v)
+            for c, radii, a, v in _spread(grid, 2, 6)
+        ),
+    ]
 
 
 def cases() -> list[Callable[[], Case]]:
@@ -101,8 +116,14 @@ def cases() -> list[Callable[[], Case]]:
     fan = FanBeam(full_turn(984), 626.0, 1098.0, 888, 0.6)
     paper = ConeBeam(full_turn(1968), 626.0, 1098.0, 1500, 40, (0.5, 0.35), detector="curved")
     inset = VolumeGrid((128, 128), 0.1, (-30.38, -29.63))
-    plaque = [VolumeGrid((n, m, m), s, (0.0, -30.38, -29.63)) for n, m, s in ((56, 45, 0.2), (113, 90, 0.1))]
-    soft = [Gaussian((0.5, -30.0, -30.0), (1.2, 1.0, 0.9), 0.4), Gaussian((-1.5, -31.5, -28.5), 0.8, value=-0.5)]
+    plaque = [
+        VolumeGrid((n, m, m), s, (0.0, -30.38, -29.63))
+        for n, m, s in ((56, 45, 0.2), (113, 90, 0.1))
+    ]
+    soft = [
+        Gaussian((0.5, -30.0, -30.0), (1.2, 1.0, 0.9), 0.4),
+        Gaussian((-1.5, -31.5, -28.5), 0.8, value=-0.5),
+    ]
     flat = FanBeam(full_turn(1968), 626.0, 1098.0, 1500, 0.35)  # ASTRA knows no curved detector
     return [
         lambda: Case("fan 512² × 984 × 888", fan, VolumeGrid((512, 512), 250 / 512)),
@@ -114,7 +135,9 @@ def cases() -> list[Callable[[], Case]]:
         ),
         lambda: Case("inset 128², 1968 × 1500", flat, inset, footprint(flat, inset)),
         lambda: Case("inset 45² × 56, 0.2 mm", paper, plaque[0], footprint(paper, plaque[0]), soft),
-        lambda: Case("inset 90² × 113, 0.1 mm", paper, plaque[1], footprint(paper, plaque[1]), soft),
+        lambda: Case(
+            "inset 90² × 113, 0.1 mm", paper, plaque[1], footprint(paper, plaque[1]), soft
+        ),
         lambda: Case(  # fewer bodies: the exact integrals of 13 million readings take a minute
             "cone 128³, 360 × 192²",
             ConeBeam(full_turn(360), 600.0, 1200.0, 192, 192, 1.5),
@@ -155,10 +178,15 @@ def astra_line(case: Case) -> Peer | None:
     (ny, nx), (cy, cx), (ey, ex) = grid.shape, grid.center, grid.extent
     volume = astra.create_vol_geom(ny, nx, cx - ex / 2, cx + ex / 2, cy - ey / 2, cy + ey / 2)
     vectors = VectorGeometry.of(g).vectors
-    kind, line = ("parallel_vec", "line") if isinstance(g, ParallelBeam) else ("fanflat_vec", "line_fanflat")
+    kind, line = (
+        ("parallel_vec", "line") if isinstance(g, ParallelBeam) else ("fanflat_vec", "line_fanflat")
+    )
     projection = astra.create_proj_geom(kind, g.columns, vectors)
     projector = astra.create_projector(line, projection, volume)
-    image_id, data_id = astra.data2d.create("-vol", volume), astra.data2d.create("-sino", projection)
+    image_id, data_id = (
+        astra.data2d.create("-vol", volume),
+        astra.data2d.create("-sino", projection),
+    )
 
     def algorithm(name: str) -> int:
         config = astra.astra_dict(name)
@@ -172,18 +200,24 @@ def astra_line(case: Case) -> Peer | None:
         astra.data2d.store(image_id, np.ascontiguousarray(image[::-1], dtype=np.float32))
         astra.algorithm.run(fp)
         data = astra.data2d.get(data_id).astype(np.float64)
-        return data if case.window is None else np.take_along_axis(data, case.window.column_indices, axis=1)
+        return (
+            data
+            if case.window is None
+            else np.take_along_axis(data, case.window.column_indices, axis=1)
+        )
 
     return Peer(lambda: astra.algorithm.run(fp), lambda: astra.algorithm.run(bp), forward)
 
 
 def xcist(case: Case, path: str | None) -> Peer | None:
-    """XCIST's distance-driven projectors on the whole detector: ``DD2FanProj``, ``DD2ParProj`` or ``DD3Proj``.
+    """XCIST's distance-driven projectors on the whole detector: ``DD2FanProj``, ``DD2ParProj`` or
+    ``DD3Proj``.
 
-    Lengths are in pixels. XCIST's axes and signs are not documented: the flips that fit the exact answer are taken,
-    found on a few views. On 3-D insets every twelfth view is projected and the time multiplied: XCIST has no window,
-    and the whole detector of all views would take minutes. On the far off-centre 2-D inset its error is larger than
-    the pixels explain (3e-2 on small Gaussians); the cause was not found, so quote that row with care.
+    Lengths are in pixels. XCIST's axes and signs are not documented: the flips that fit the exact
+    answer are taken, found on a few views. On 3-D insets every twelfth view is projected and the
+    time multiplied: XCIST has no window, and the whole detector of all views would take minutes. On
+    the far off-centre 2-D inset its error is larger than the pixels explain (3e-2 on small
+    Gaussians); the cause was not found, so quote that row with care.
     """
     if path is None:
         return None
@@ -202,7 +236,11 @@ def xcist(case: Case, path: str | None) -> Peer | None:
     xds, yds = (np.ascontiguousarray(v / pixel, dtype=np.float32) for v in (xds, yds))
     rows = slice(0, 1)
     if solid:
-        rows = slice(case.window.first_row, case.window.first_row + case.window.rows) if case.window else slice(None)
+        rows = (
+            slice(case.window.first_row, case.window.first_row + case.window.rows)
+            if case.window
+            else slice(None)
+        )
         zds = np.ascontiguousarray(g.row_positions[rows] / pixel, dtype=np.float32)
         shape: tuple[int, ...] = (angles.size, g.columns, zds.size)
         image = np.zeros((*grid.shape[1:], grid.shape[0]), dtype=np.float32)
@@ -218,22 +256,54 @@ def xcist(case: Case, path: str | None) -> Peer | None:
     def run(signs: tuple[int, int, int], back: bool = False, views: np.ndarray = angles) -> None:
         i, f = ctypes.c_int, ctypes.c_float
         swap, sx, sy = signs
-        dx, dy = (float(s) * float(v) for s, v in zip((sx, sy), shift if swap else shift[::-1], strict=True))
+        dx, dy = (
+            float(s) * float(v)
+            for s, v in zip((sx, sy), shift if swap else shift[::-1], strict=True)
+        )
         n = i(views.size)
         if solid:
             library.DD3Proj(
-                f(0.0), f(sod / pixel), f(0.0), i(g.columns), i(zds.size), pointer(xds), pointer(yds), pointer(zds),
-                f(1.0), f(dx), f(dy), f(grid.center[0] / pixel), pointer(views), pointer(heights), n, pointer(data),
-                i(grid.shape[2]), i(grid.shape[1]), i(grid.shape[0]), pointer(image),
-            )  # fmt: skip
+                f(0.0),
+                f(sod / pixel),
+                f(0.0),
+                i(g.columns),
+                i(zds.size),
+                pointer(xds),
+                pointer(yds),
+                pointer(zds),
+                f(1.0),
+                f(dx),
+                f(dy),
+                f(grid.center[0] / pixel),
+                pointer(views),
+                pointer(heights),
+                n,
+                pointer(data),
+                i(grid.shape[2]),
+                i(grid.shape[1]),
+                i(grid.shape[0]),
+                pointer(image),
+            )
             return
         source = () if isinstance(g, ParallelBeam) else (f(dx), f(sod / pixel + dy))
         x, y = (np.ascontiguousarray(v + np.float32(d)) for v, d in ((xds, dx), (yds, dy)))
-        name = "DD2ParProj" if isinstance(g, ParallelBeam) else "DD2FanBack" if back else "DD2FanProj"
+        name = (
+            "DD2ParProj" if isinstance(g, ParallelBeam) else "DD2FanBack" if back else "DD2FanProj"
+        )
         getattr(library, name)(
-            i(g.columns), *source, pointer(x), pointer(y), f(dx), f(dy), pointer(views), n, pointer(data),
-            i(grid.shape[1]), i(grid.shape[0]), pointer(image),
-        )  # fmt: skip
+            i(g.columns),
+            *source,
+            pointer(x),
+            pointer(y),
+            f(dx),
+            f(dy),
+            pointer(views),
+            n,
+            pointer(data),
+            i(grid.shape[1]),
+            i(grid.shape[0]),
+            pointer(image),
+        )
 
     def apply(x: np.ndarray, flips: Any, views: np.ndarray) -> np.ndarray:
         planes = x.transpose(1, 2, 0) if solid else x
@@ -256,7 +326,9 @@ def xcist(case: Case, path: str | None) -> Peer | None:
     indices = np.arange(g.views)[::every]
     best, chosen = math.inf, (0,) * 6
     for flips in np.ndindex(2, 2, 2, 2, *((2, 2) if shift.any() else (1, 1))):
-        found = crop(apply(case.images["gaussians"], flips, np.ascontiguousarray(angles[few])), indices[few])
+        found = crop(
+            apply(case.images["gaussians"], flips, np.ascontiguousarray(angles[few])), indices[few]
+        )
         error = float(np.linalg.norm(found - case.exact["gaussians"][indices[few]]))
         if error < best:
             best, chosen = error, flips
@@ -282,7 +354,9 @@ def measure(case: Case, repeats: int, library: str | None) -> list[dict[str, Any
     present = {name: peer for name, peer in found.items() if peer is not None}
     rows: list[dict[str, Any]] = []
     for name, peer in present.items():
-        rows.append({"case": case.name, "projector": name, "every": peer.every, **case.errors(peer)})
+        rows.append(
+            {"case": case.name, "projector": name, "every": peer.every, **case.errors(peer)}
+        )
     times: dict[tuple[str, int], list[float]] = {}
     for repeat in range(repeats + 1):
         for name, peer in present.items():
@@ -292,7 +366,9 @@ def measure(case: Case, repeats: int, library: str | None) -> list[dict[str, Any
                 begin = time.perf_counter()
                 work()
                 if repeat:  # the first round warms caches
-                    times.setdefault((name, direction), []).append((time.perf_counter() - begin) * peer.every)
+                    times.setdefault((name, direction), []).append(
+                        (time.perf_counter() - begin) * peer.every
+                    )
     for row in rows:
         for direction, key in ((0, "forward"), (1, "adjoint")):
             values = times.get((row["projector"], direction), [math.nan])
@@ -302,18 +378,22 @@ def measure(case: Case, repeats: int, library: str | None) -> list[dict[str, Any
 
 def table(rows: list[dict[str, Any]]) -> str:
     lines = [
-        "| case | projector | forward s: median (min) | adjoint s | error Gaussians | error ellipses |",
+        "| case | projector | forward s: median (min) | adjoint s | error Gaussians | error "
+        "ellipses |",
         "|---|---|---|---|---|---|",
     ]
     for r in rows:
         ellipses = f"{r['ellipses']:.2e}" if "ellipses" in r else "–"
         forward, adjoint = (
-            "–" if math.isnan(r[f"{key} median s"]) else f"{r[f'{key} median s']:.3f} ({r[f'{key} min s']:.3f})"
+            "–"
+            if math.isnan(r[f"{key} median s"])
+            else f"{r[f'{key} median s']:.3f} ({r[f'{key} min s']:.3f})"
             for key in ("forward", "adjoint")
         )
         note = f" (one view in {r['every']}, × {r['every']})" if r["every"] > 1 else ""
         lines.append(
-            f"| {r['case']} | {r['projector']}{note} | {forward} | {adjoint} | {r['gaussians']:.2e} | {ellipses} |"
+            f"| {r['case']} | {r['projector']}{note} | {forward} | {adjoint} | "
+            f"{r['gaussians']:.2e} | {ellipses} |"
         )
     return "\n".join(lines)
 
@@ -326,13 +406,20 @@ def picture(rows: list[dict[str, Any]], path: Path) -> None:
     from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
     names = list(dict.fromkeys(r["case"] for r in rows))
-    figure, axes = plt.subplots(2, math.ceil(len(names) / 2), figsize=(3.6 * math.ceil(len(names) / 2), 6.4))
+    figure, axes = plt.subplots(
+        2, math.ceil(len(names) / 2), figsize=(3.6 * math.ceil(len(names) / 2), 6.4)
+    )
     marks = ["C0o", "C0<", "C0s", "C1^", "C3v"]
     style = dict(zip(dict.fromkeys(r["projector"] for r in rows), marks, strict=False))
     for axis, name in zip(axes.flat, names, strict=False):
         for r in rows:
             if r["case"] == name:
-                axis.loglog(r["forward median s"], r["gaussians"], style[r["projector"]], label=r["projector"])
+                axis.loglog(
+                    r["forward median s"],
+                    r["gaussians"],
+                    style[r["projector"]],
+                    label=r["projector"],
+                )
         axis.set_title(name, fontsize=9)
         axis.set_xlabel("forward projection, s (median)", fontsize=8)
         axis.set_ylabel("relative L2 error", fontsize=8)
@@ -366,14 +453,17 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     for make in cases():
         rows += measure(make(), options.repeats, library)
-        print(_write(rows, options.out).splitlines()[-1], flush=True)  # a run cut short keeps what it measured
+        # a run cut short keeps what it measured
+        print(_write(rows, options.out).splitlines()[-1], flush=True)
 
 
 def _machine() -> str:
     """Processor and number of cores."""
     info = Path("/proc/cpuinfo")
     names = (
-        [x.split(":")[1].strip() for x in info.read_text().splitlines() if "model name" in x] if info.exists() else []
+        [x.split(":")[1].strip() for x in info.read_text().splitlines() if "model name" in x]
+        if info.exists()
+        else []
     )
     return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
 
@@ -381,7 +471,8 @@ def _machine() -> str:
 def _write(rows: list[dict[str, Any]], out: Path) -> str:
     now = datetime.datetime.now(datetime.UTC)
     report = (
-        f"{_machine()}, torch {torch.__version__}, {now:%Y-%m-%d %H:%M} UTC, load {os.getloadavg()[0]:.1f} at the end"
+        f"{_machine()}, torch {torch.__version__}, {now:%Y-%m-%d %H:%M} UTC, load "
+        f"{os.getloadavg()[0]:.1f} at the end"
     )
     report += f"\n\n{table(rows)}\n"
     (out / "projectors.md").write_text(report)

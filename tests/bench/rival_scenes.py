@@ -1,8 +1,9 @@
 """Held-out plaques and noise draws that ``rivals.py`` tunes filters on.
 
-Vessels of four directions are painted on 0.1 mm voxels and projected; their truth is that of volume fractions, to
-0.5 HU rms. Noise is that of real counts of the paper's scan (1968 views): noisy minus noise-free FBP, and the same of
-b = AᵀW y; what else is scanned changes the counts by a few per cent at most.
+Vessels of four directions are painted on 0.1 mm voxels and projected; their truth is that of volume
+fractions, to 0.5 HU rms. Noise is that of real counts of the paper's scan (1968 views): noisy minus
+noise-free FBP, and the same of b = AᵀW y; what else is scanned changes the counts by a few per cent
+at most.
 """
 
 from dataclasses import dataclass
@@ -29,29 +30,39 @@ from torchpcct.scene.scene import Scene
 from torchpcct.volume import to_hu
 
 ROD_HU = {"fat": -92.65, "wall": 63.53, "fibrous": 103.22, "lumen": 479.97, "core": 41.07}
-"""CT numbers of 4 mm rods of each tissue at the plaque's place (:mod:`recon.study.paper.plaque_scan`)."""
+"""CT numbers of 4 mm rods of each tissue at the plaque's place
+(:mod:`recon.study.paper.plaque_scan`)."""
 KERNELS = ("soft", "standard", "detail")
 _X, _Y, _Z = np.eye(3)
 _H = 0.5**0.5
 _HELD_OUT: dict[str, tuple[Centreline, dict[str, Any], tuple[float, ...]]] = {
     "along z": (
         Centreline(_Z, -_X),
-        {"vessel_diameter": 4.0, "wall_thickness": 0.25, "cap_thickness": 0.22, "bulge": 0.55,
-         "core_semi_axes": (0.6, 0.8, 1.3)}, (0.0, 50.0, 92.0, 430.0, 30.0),
+        {
+            "vessel_diameter": 4.0,
+            "wall_thickness": 0.25,
+            "cap_thickness": 0.22,
+            "bulge": 0.55,
+            "core_semi_axes": (0.6, 0.8, 1.3),
+        },
+        (0.0, 50.0, 92.0, 430.0, 30.0),
     ),
     "tilted": (
-        Centreline((_H, 0.0, _H), _Y), {"vessel_diameter": 2.8, "bulge": 0.45, "core_semi_axes": (0.45, 0.7, 0.7)},
+        Centreline((_H, 0.0, _H), _Y),
+        {"vessel_diameter": 2.8, "bulge": 0.45, "core_semi_axes": (0.45, 0.7, 0.7)},
         (0.0, 45.0, 100.0, 380.0, 20.0),
     ),
     "in plane": (
-        Centreline(_Y, -_Z), {"vessel_diameter": 3.0, "bulge": 0.5, "core_semi_axes": (0.5, 0.7, 0.9)},
+        Centreline(_Y, -_Z),
+        {"vessel_diameter": 3.0, "bulge": 0.5, "core_semi_axes": (0.5, 0.7, 0.9)},
         (0.0, 55.0, 90.0, 400.0, 45.0),
     ),
     "curved": (
-        Centreline(_X, _Z, 6.5), {"vessel_diameter": 3.6, "bulge": 0.5, "core_semi_axes": (0.55, 1.1, 0.8)},
+        Centreline(_X, _Z, 6.5),
+        {"vessel_diameter": 3.6, "bulge": 0.5, "core_semi_axes": (0.55, 1.1, 0.8)},
         (0.0, 60.0, 110.0, 460.0, 40.0),
     ),
-}  # fmt: skip
+}
 """Centreline, plaque, and HU of fat, wall, fibrous tissue, lumen and core (fat's is added)."""
 DIRECTIONS = tuple(_HELD_OUT)
 TISSUES = ("patient", "wall", "fibrous", "lumen", "core")
@@ -64,7 +75,8 @@ class Place:
 
     Attributes:
         fbp: ``(kernels, z, y, x)`` HU; b: ``(z, y, x)`` at 1 s; true: ``(z, y, x)`` HU.
-        inside, flat: masks of the error and of the noise; core, around: of the core and of the fibrous tissue about it.
+        inside, flat: masks of the error and of the noise; core, around: of the core and of the
+            fibrous tissue about it.
     """
 
     fbp: Tensor
@@ -99,14 +111,19 @@ class Bench:
         def compute() -> dict[str, Any]:
             noisy = self.clean.with_noise(dose, k)
             b = [self.problem.statistic(s).b for s in (noisy, self.clean)]
-            return {"fbp": (self.fbp(noisy)[0] - self.fbp(self.clean)[0]).numpy(), "b": (b[0] - dose * b[1]).numpy()}
+            return {
+                "fbp": (self.fbp(noisy)[0] - self.fbp(self.clean)[0]).numpy(),
+                "b": (b[0] - dose * b[1]).numpy(),
+            }
 
         found = self.store.piece(f"draws/{dose:g}_{k}", "1", compute)
         return torch.from_numpy(found["fbp"]), torch.from_numpy(found["b"])
 
     def painted(self, vessel: Vessel, values: dict[str, float]) -> tuple[Tensor, Tensor]:
         """FBP and b of a vessel in any direction, on 0.1 mm voxels."""
-        return self.projected(vessel.painted(self.fine, {k: h - values["patient"] for k, h in values.items()}))
+        return self.projected(
+            vessel.painted(self.fine, {k: h - values["patient"] for k, h in values.items()})
+        )
 
     @property
     def fine(self) -> VolumeGrid:
@@ -115,7 +132,8 @@ class Bench:
         return VolumeGrid(tuple(2 * n for n in g.shape), g.spacing[0] / 2, g.center)
 
     def projected(self, above_fat: Any) -> tuple[Tensor, Tensor]:
-        """FBP ``(kernels, z, y, x)`` in HU and b of the patient with so many HU added on the fine grid."""
+        """FBP ``(kernels, z, y, x)`` in HU and b of the patient with so many HU added on the
+        fine grid."""
         p, window = self.problem, self.clean.window
         added = torch.from_numpy(above_fat * (p.mu_ref / 1000.0)).float()
         lines = Projector(p.geometry, self.fine, window)(added)
@@ -141,7 +159,10 @@ class Bench:
             fbp, b = self.painted(vessel, values)
             return {"fbp": fbp.numpy(), "b": b.numpy()}
 
-        found = {k: torch.from_numpy(v).float() for k, v in self.store.piece(f"places/{name}", "3", compute).items()}
+        found = {
+            k: torch.from_numpy(v).float()
+            for k, v in self.store.piece(f"places/{name}", "3", compute).items()
+        }
         share = {k: torch.from_numpy(v).float() for k, v in vessel.shares(self.grid).items()}
         true = sum(share[k] * values[k] for k in TISSUES)
         fat = share["patient"] > 1 - 1e-6
@@ -149,6 +170,10 @@ class Bench:
         flat = torch.zeros_like(fat)
         flat[4:-4, 4:-4, 4:-4] = (away > 1.5)[4:-4, 4:-4, 4:-4]
         core = share["core"] > 0.8
-        beside = torch.from_numpy(ndimage.distance_transform_edt(~core.numpy(), self.grid.spacing) < 1.2)
+        beside = torch.from_numpy(
+            ndimage.distance_transform_edt(~core.numpy(), self.grid.spacing) < 1.2
+        )
         around = (share["fibrous"] > 0.8) & beside
-        return Place(**found, true=true, inside=share["patient"] < 0.5, flat=flat, core=core, around=around)
+        return Place(
+            **found, true=true, inside=share["patient"] < 0.5, flat=flat, core=core, around=around
+        )

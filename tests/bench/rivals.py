@@ -2,11 +2,12 @@
 
     python tests/bench/rivals.py [--filters NAME ...] [--bases NAME ...] [--doses S ...]
 
-For every exposure, filter and base (FBP kernel on 0.2 mm, PWLS) the settings with the least error in the vessel, mean
-over four held-out plaques on vessels along z, tilted, in plane and curved (other diameters, plaques, tissue values and
-draws than those of any task). Results are written one by one into ``recon/evaluate/rivals_tuning.json``, where the
-methods ``FILTER@fbp:KERNEL`` of :mod:`recon.evaluate` find them, and kept: the same command goes on. BM4D (licence:
-non-commercial) counts where it is installed.
+For every exposure, filter and base (FBP kernel on 0.2 mm, PWLS) the settings with the least error
+in the vessel, mean over four held-out plaques on vessels along z, tilted, in plane and curved
+(other diameters, plaques, tissue values and draws than those of any task). Results are written one
+by one into ``recon/evaluate/rivals_tuning.json``, where the methods ``FILTER@fbp:KERNEL`` of
+:mod:`recon.evaluate` find them, and kept: the same command goes on. BM4D (licence: non-commercial)
+counts where it is installed.
 """
 
 import argparse
@@ -35,19 +36,29 @@ from torchpcct.volume import to_hu
 HERE = Path(__file__).parent
 TUNED = Path(str(recon.evaluate.__path__[0])) / "rivals_tuning.json"
 """Where the instrument finds them."""
-DOSES, BASES = (0.35, 0.7, 2.0), (*KERNELS, "pwls")
+DOSES = (0.35, 0.7, 2.0)
+BASES = (*KERNELS, "pwls")
 SEARCH: dict[str, dict[str, list[Any]]] = {
     "gaussian": {"sigma": [0.4, 0.6, 0.8, 1.0, 1.3]},
     "perona_malik": {
-        "edge": [0.8, 1.0, 1.3, 1.6, 2.0, 2.5], "steps": [4, 8, 15, 25, 40], "sigma": [0.4, 0.55, 0.7, 0.9, 1.2, 1.6],
+        "edge": [0.8, 1.0, 1.3, 1.6, 2.0, 2.5],
+        "steps": [4, 8, 15, 25, 40],
+        "sigma": [0.4, 0.55, 0.7, 0.9, 1.2, 1.6],
     },
     "bilateral": {
-        "edge": [1.0, 1.4, 2.0, 2.8, 4.0], "reach": [0.8, 1.1, 1.5, 2.0, 2.5, 3.0], "sigma": [0.4, 0.7, 1.0, 1.4, 1.9],
+        "edge": [1.0, 1.4, 2.0, 2.8, 4.0],
+        "reach": [0.8, 1.1, 1.5, 2.0, 2.5, 3.0],
+        "sigma": [0.4, 0.7, 1.0, 1.4, 1.9],
     },
-    "nlm": {"strength": [0.4, 0.6, 0.8, 1.1, 1.5], "patch": [1, 2, 3], "search": [3, 4], "told": [0.75, 1.0, 1.25]},
+    "nlm": {
+        "strength": [0.4, 0.6, 0.8, 1.1, 1.5],
+        "patch": [1, 2, 3],
+        "search": [3, 4],
+        "told": [0.75, 1.0, 1.25],
+    },
     "tv": {"strength": [0.15, 0.3, 0.5, 0.7, 1.0, 1.5, 2.2, 3.0]},
     "bm4d": {"strength": [0.8, 1.0, 1.25]},
-}  # fmt: skip
+}
 TUNED_DRAWS = {"nlm": 1, "bm4d": 1}
 """Draws of each direction; 2 where not named."""
 FIRST_SEED = 1000
@@ -62,11 +73,16 @@ class Methods:
 
     @lru_cache(maxsize=256)  # noqa: B019
     def level(self, base: str, dose: float, sigma: float) -> float:
-        """Noise in fat of a base smoothed by ``sigma``, HU: of the noise alone, on the tuning's draws."""
+        """Noise in fat of a base smoothed by ``sigma``, HU: of the noise alone, on the tuning's
+        draws."""
         place = self.bench.held_out("along z")
         clean = self.base(base, "along z", dose, None)
-        found = [flat_noise(self.base(base, "along z", dose, FIRST_SEED + k) - clean, place.flat, sigma=sigma)
-                 for k in range(2)]  # fmt: skip
+        found = [
+            flat_noise(
+                self.base(base, "along z", dose, FIRST_SEED + k) - clean, place.flat, sigma=sigma
+            )
+            for k in range(2)
+        ]
         return float(np.sqrt(np.mean(np.square(found))))
 
     @lru_cache(maxsize=64)  # noqa: B019
@@ -88,11 +104,16 @@ class Methods:
         b = self.bench
         middle = [n // 2 for n in b.grid.shape]
         fbp = InsetFbp(b.clean, [b.grid], [kernel])
-        found = b.store.piece(f"covariance_{kernel}", "1", lambda: {
-            "c": voxel_covariance(b.clean, fbp, 1.0, middle).numpy()})["c"]  # fmt: skip
+        found = b.store.piece(
+            f"covariance_{kernel}",
+            "1",
+            lambda: {"c": voxel_covariance(b.clean, fbp, 1.0, middle).numpy()},
+        )["c"]
         return found[tuple(slice(m - 10, m + 11) for m in middle)]
 
-    def filtered(self, name: str, base: str, volume: Tensor, dose: float, settings: dict[str, Any]) -> Tensor:
+    def filtered(
+        self, name: str, base: str, volume: Tensor, dose: float, settings: dict[str, Any]
+    ) -> Tensor:
         """A base's volume filtered."""
         sigma = settings.get("sigma", 0.0) if name in ("perona_malik", "bilateral") else 0.0
         more = {"covariance": self.covariance(base)} if name == "bm4d" else {}
@@ -104,7 +125,9 @@ def error(volume: Tensor, place: Place) -> float:
     return float((volume - place.true)[place.inside].double().square().mean())
 
 
-def tune(bench: Bench, folder: Path, doses: list[float], names: list[str], bases: list[str]) -> None:
+def tune(
+    bench: Bench, folder: Path, doses: list[float], names: list[str], bases: list[str]
+) -> None:
     """Settings of every filter on every base."""
     methods, path = Methods(bench), TUNED
     for dose, name, base in itertools.product(doses, names, bases):
@@ -124,7 +147,11 @@ def tune(bench: Bench, folder: Path, doses: list[float], names: list[str], bases
 def searched(methods: Methods, name: str, base: str, dose: float) -> dict[str, Any]:
     """Coordinate search from the middle of every setting's values."""
     draws = TUNED_DRAWS.get(name, 1 if base == "pwls" else 2)
-    cases = [(direction, FIRST_SEED + (i + 2 * k) % 4) for i, direction in enumerate(DIRECTIONS) for k in range(draws)]
+    cases = [
+        (direction, FIRST_SEED + (i + 2 * k) % 4)
+        for i, direction in enumerate(DIRECTIONS)
+        for k in range(draws)
+    ]
     values = SEARCH[name]
     tried: dict[tuple[int, ...], dict[str, float]] = {}
 
@@ -132,7 +159,9 @@ def searched(methods: Methods, name: str, base: str, dose: float) -> dict[str, A
         squares: dict[str, list[float]] = {}
         for direction, seed in cases:
             volume = change(methods.base(base, direction, dose, seed))
-            squares.setdefault(direction, []).append(error(volume, methods.bench.held_out(direction)))
+            squares.setdefault(direction, []).append(
+                error(volume, methods.bench.held_out(direction))
+            )
         return {direction: float(np.sqrt(np.mean(v))) for direction, v in squares.items()}
 
     def settings(at: tuple[int, ...]) -> dict[str, Any]:
@@ -152,8 +181,13 @@ def searched(methods: Methods, name: str, base: str, dose: float) -> dict[str, A
             while mean(there := (*best[:axis], best[axis] + step, *best[axis + 1 :])) < mean(best):
                 best = there
     plain = float(np.mean(list(by_direction(lambda u: u).values())))
-    return {"settings": settings(best), "rmse_hu": mean(best), "directions": tried[best], "unfiltered_hu": plain,
-            "tried": len(tried)}  # fmt: skip
+    return {
+        "settings": settings(best),
+        "rmse_hu": mean(best),
+        "directions": tried[best],
+        "unfiltered_hu": plain,
+        "tried": len(tried),
+    }
 
 
 def read(path: Path) -> Any:
@@ -166,7 +200,8 @@ def tuning_text(kept: dict[str, Any]) -> str:
     lines = [
         "# Settings of the rivals",
         "",
-        "`python tests/bench/rivals.py`: error in the vessel, HU, on held-out plaques; lengths in voxels of "
+        "`python tests/bench/rivals.py`: error in the vessel, HU, on held-out plaques; lengths in "
+        "voxels of "
         "0.2 mm, thresholds in units of the noise.",
         "",
         f"| s | base | filter | unfiltered | mean | {' | '.join(DIRECTIONS)} | settings |",
@@ -176,18 +211,27 @@ def tuning_text(kept: dict[str, Any]) -> str:
         for method, t in sorted(at.items(), key=lambda item: item[1]["rmse_hu"]):
             base, _, name = method.partition(" + ")
             settings = ", ".join(f"{k} {v:g}" for k, v in t["settings"].items())
-            lines.append(f"| {dose} | {base} | {name} | {t['unfiltered_hu']:.1f} | {t['rmse_hu']:.1f} | "
-                         + " | ".join(f"{v:.1f}" for v in t["directions"].values()) + f" | {settings} |")  # fmt: skip
+            lines.append(
+                f"| {dose} | {base} | {name} | {t['unfiltered_hu']:.1f} | {t['rmse_hu']:.1f} | "
+                + " | ".join(f"{v:.1f}" for v in t["directions"].values())
+                + f" | {settings} |"
+            )
     return "\n".join([*lines, ""])
 
 
 def main() -> None:
     """Tune."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--doses", type=float, nargs="+", default=list(DOSES), metavar="S")
-    parser.add_argument("--filters", nargs="+", default=list(SEARCH), choices=SEARCH, metavar="NAME")
+    parser.add_argument(
+        "--filters", nargs="+", default=list(SEARCH), choices=SEARCH, metavar="NAME"
+    )
     parser.add_argument("--bases", nargs="+", default=list(BASES), choices=BASES, metavar="NAME")
-    parser.add_argument("--work", type=Path, default=Path("out/bench-rivals"), help="folder of scans and draws")
+    parser.add_argument(
+        "--work", type=Path, default=Path("out/bench-rivals"), help="folder of scans and draws"
+    )
     parser.add_argument("--out", type=Path, default=HERE, help="folder of the text")
     options = parser.parse_args()
     torch.set_num_threads(1)

@@ -1,11 +1,13 @@
-"""Error against exact projection pairs and time: Gram-preconditioned PWLS, FISTA and ordered subsets, one problem.
+"""Error against exact projection pairs and time: Gram-preconditioned PWLS, FISTA and ordered
+subsets, one problem.
 
     python tests/bench/solvers.py [--views 1968] [--voxel 0.2] [--out tests/bench]
 
-The problem is the paper's plaque at 2.0 s with the package's q-GGMRF prior, on the inset's footprint. The reference is
-the float64 minimum, converged to 1e-3 HU. FISTA is the accelerated gradient method with the separable (SQS) majoriser
-of data and prior (Beck, Teboulle 2009; Erdogan, Fessler 1999); OS-SQS replaces the data gradient by that of one of
-12 subsets of the views, with momentum (Kim, Ramani, Fessler 2015). One pair is one A and one Aᵀ of all views.
+The problem is the paper's plaque at 2.0 s with the package's q-GGMRF prior, on the inset's
+footprint. The reference is the float64 minimum, converged to 1e-3 HU. FISTA is the accelerated
+gradient method with the separable (SQS) majoriser of data and prior (Beck, Teboulle 2009; Erdogan,
+Fessler 1999); OS-SQS replaces the data gradient by that of one of 12 subsets of the views, with
+momentum (Kim, Ramani, Fessler 2015). One pair is one A and one Aᵀ of all views.
 """
 
 import argparse
@@ -50,9 +52,15 @@ class Problem:
         self.gram_seconds = time.perf_counter() - start
         self.prior = DEFAULT_PRIOR.bind(self.gram.information(self.hu), grid.spacing, self.hu)
         self.reference = pwls(
-            self.A, self.y.double(), self.w.double(), self.prior, mu_per_hu=self.hu, gram=self.gram, tolerance=1e-3,
+            self.A,
+            self.y.double(),
+            self.w.double(),
+            self.prior,
+            mu_per_hu=self.hu,
+            gram=self.gram,
+            tolerance=1e-3,
             max_exact=60,
-        ).x  # fmt: skip
+        ).x
 
     def rmsd(self, x: Tensor) -> float:
         """Root mean square distance to the minimum, HU."""
@@ -68,7 +76,9 @@ def ours(p: Problem) -> Iterator[tuple[float, float, float]]:
     """(pairs, seconds, HU) of PWLS stopped after more and more pairs."""
     for most in (1, 2, 3, 4, 6):
         start = time.perf_counter()
-        result = pwls(p.A, p.y, p.w, p.prior, mu_per_hu=p.hu, gram=p.gram, tolerance=1e-6, max_exact=most)
+        result = pwls(
+            p.A, p.y, p.w, p.prior, mu_per_hu=p.hu, gram=p.gram, tolerance=1e-6, max_exact=most
+        )
         yield result.report["exact_pairs"], time.perf_counter() - start, p.rmsd(result.x)
 
 
@@ -84,7 +94,9 @@ def ordered_subsets(p: Problem, passes: int = 30) -> Iterator[tuple[float, float
     gradients = []
     for first in sorted(range(SUBSETS), key=lambda k: f"{k:04b}"[::-1]):
         views = np.arange(first, g.views, SUBSETS)
-        part = DetectorWindow(window.first_column[views], window.columns, window.first_row, window.rows)
+        part = DetectorWindow(
+            window.first_column[views], window.columns, window.first_row, window.rows
+        )
         A = Projector(g.select(views), p.grid, part)
         index = torch.from_numpy(views)
         w, y = p.w[index], p.y[index]
@@ -122,26 +134,31 @@ def main() -> None:
     curves = {
         "Gram + exact pairs": list(ours(p)),
         "FISTA (SQS)": list(fista(p, args.iterations)),
-        f"OS-SQS, {SUBSETS} subsets, momentum": list(ordered_subsets(p, max(1, args.iterations // 2))),
+        f"OS-SQS, {SUBSETS} subsets, momentum": list(
+            ordered_subsets(p, max(1, args.iterations // 2))
+        ),
     }
     rows = []
     for name, points in curves.items():
         for pairs, seconds, hu in points:
             if pairs in (1, 2, 3, 4, 6, 10, 20, 30, 60):
                 rows.append(f"| {name} | {pairs:g} | {seconds:.2f} | {hu:.3g} |")
-    text = "\n".join([
-        "# PWLS: distance to the converged minimum",
-        "",
-        f"`python tests/bench/solvers.py --views {args.views} --voxel {args.voxel:g}`; the Gram operator "
-        f"({p.gram_seconds:.1f} s once per scan) is not counted.",
-        "",
-        "| solver | exact pairs | seconds | rms distance, HU |",
-        "|---|---|---|---|",
-        *rows,
-        "",
-        "![Distance to the minimum](solvers.png)",
-        "",
-    ])  # fmt: skip
+    text = "\n".join(
+        [
+            "# PWLS: distance to the converged minimum",
+            "",
+            f"`python tests/bench/solvers.py --views {args.views} --voxel {args.voxel:g}`; the "
+            "Gram operator "
+            f"({p.gram_seconds:.1f} s once per scan) is not counted.",
+            "",
+            "| solver | exact pairs | seconds | rms distance, HU |",
+            "|---|---|---|---|",
+            *rows,
+            "",
+            "![Distance to the minimum](solvers.png)",
+            "",
+        ]
+    )
     print(text)
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "solvers.md").write_text(text)

@@ -2,8 +2,9 @@
 
 ``python tests/bench/wheel.py [PIP OPTION …]``
 
-Nothing of the repository is on the path of that environment: what the wheel lacks (weights, ``py.typed``, a package, a
-dependency) fails here. Options go to ``pip install``, e.g. ``--extra-index-url https://download.pytorch.org/whl/cpu``.
+Nothing of the repository is on the path of that environment: what the wheel lacks (weights,
+``py.typed``, a package, a dependency) fails here. Options go to ``pip install``, e.g.
+``--extra-index-url https://download.pytorch.org/whl/cpu``.
 """
 
 import os
@@ -16,7 +17,9 @@ import venv
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-REQUIRES = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["build-system"]["requires"]
+REQUIRES = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["build-system"][
+    "requires"
+]
 
 SMOKE = """
 import recon, torchpcct, train
@@ -62,9 +65,12 @@ TRAINING = """
 
 
 def build(folder: Path) -> Path:
-    """The source distribution of what git knows (an old ``build`` folder would add modules that are gone), and the
-    wheel that is built from it, as installing the source distribution would do; both in ``folder``."""
-    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    """The source distribution of what git knows (an old ``build`` folder would add modules that are
+    gone), and the wheel that is built from it, as installing the source distribution would do; both
+    in ``folder``."""
+    listed = subprocess.run(
+        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
     for name in (name for name in listed.splitlines() if (ROOT / name).is_file()):
         (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, folder / "source" / name)
@@ -72,7 +78,9 @@ def build(folder: Path) -> Path:
     python = folder / "builder" / ("Scripts" if os.name == "nt" else "bin") / "python"
     subprocess.run([python, "-m", "pip", "install", "-q", *REQUIRES], cwd=folder, check=True)
     sdist = f"from setuptools import build_meta; build_meta.build_sdist({str(folder)!r})"
-    subprocess.run([python, "-c", sdist], cwd=folder / "source", stdout=subprocess.DEVNULL, check=True)
+    subprocess.run(
+        [python, "-c", sdist], cwd=folder / "source", stdout=subprocess.DEVNULL, check=True
+    )
     (archive,) = folder.glob("*.tar.gz")
     command = [python, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(folder), str(archive)]
     subprocess.run(command, cwd=folder, check=True)
@@ -93,9 +101,29 @@ def main(options: list[str]) -> int:
         venv.create(folder / "empty", with_pip=True)
         scripts = folder / "empty" / ("Scripts" if os.name == "nt" else "bin")
         python = scripts / "python"
-        run(python, "-m", "pip", "install", "-q", "-c", ROOT / "constraints.txt", *options, wheel, folder=folder)
+        run(
+            python,
+            "-m",
+            "pip",
+            "install",
+            "-q",
+            "-c",
+            ROOT / "constraints.txt",
+            *options,
+            wheel,
+            folder=folder,
+        )
         run(scripts / "torchpcct", "--version", folder=folder)
-        run(scripts / "torchpcct", "study", "phantom", "--quick", "--no-progress", "--out", "out", folder=folder)
+        run(
+            scripts / "torchpcct",
+            "study",
+            "phantom",
+            "--quick",
+            "--no-progress",
+            "--out",
+            "out",
+            folder=folder,
+        )
         run(python, "-c", SMOKE, folder=folder)
         run(scripts / "torchpcct", "info", "scan.h5", folder=folder)
         (folder / "nets.py").write_text(NETWORK, encoding="utf-8")

@@ -1,9 +1,9 @@
 """Exact line integrals of ellipses, ellipsoids and Gaussians, averaged over the detector cells.
 
-The oracle of the projector: nothing here knows of voxels. Chord of a ray ``p + λ d`` (``|d| = 1``) in an ellipsoid
-``|M (x - c)| ≤ 1``: with ``a = M d``, ``b = M (p - c)`` it is ``2 √(max((a·b)² - |a|² (|b|² - 1), 0)) / |a|²``. Line
-integral of ``exp(-|M (x - c)|² / 2)``: ``√(2π) / |a| · exp(-(|b|² - (a·b)² / |a|²) / 2)``. Sub-rays spread evenly over
-each cell give the cell average.
+The oracle of the projector: nothing here knows of voxels. Chord of a ray ``p + λ d`` (``|d| = 1``)
+in an ellipsoid ``|M (x - c)| ≤ 1``: with ``a = M d``, ``b = M (p - c)`` it is ``2 √(max((a·b)² -
+|a|² (|b|² - 1), 0)) / |a|²``. Line integral of ``exp(-|M (x - c)|² / 2)``: ``√(2π) / |a| ·
+exp(-(|b|² - (a·b)² / |a|²) / 2)``. Sub-rays spread evenly over each cell give the cell average.
 """
 
 import math
@@ -34,16 +34,23 @@ class _Body:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", per_axis("center", self.center, len(self.center)))
-        object.__setattr__(self, "radii", per_axis("radii", self.radii, len(self.center), positive=True))
+        object.__setattr__(
+            self, "radii", per_axis("radii", self.radii, len(self.center), positive=True)
+        )
 
     @property
     def _frame(self) -> tuple[Floats, Floats]:
-        """Centre ``(x, y, z)`` and the matrix M to the unit ball; a 2-D body is a cylinder along z."""
+        """Centre ``(x, y, z)`` and the matrix M to the unit ball; a 2-D body is a cylinder along
+        z."""
         cy, cx = self.center[-2:]
         ry, rx = self.radii[-2:]
         c, s = math.cos(self.angle), math.sin(self.angle)
         flat = len(self.center) == 2
-        rows = [[c / rx, s / rx, 0.0], [-s / ry, c / ry, 0.0], [0.0, 0.0, 0.0 if flat else 1.0 / self.radii[0]]]
+        rows = [
+            [c / rx, s / rx, 0.0],
+            [-s / ry, c / ry, 0.0],
+            [0.0, 0.0, 0.0 if flat else 1.0 / self.radii[0]],
+        ]
         return np.array([cx, cy, 0.0 if flat else self.center[0]]), np.array(rows)
 
     def _chord(self, aa: Floats, ab: Floats, bb: Floats) -> Floats:
@@ -53,7 +60,8 @@ class _Body:
         raise NotImplementedError
 
     def along(self, point: Floats, direction: Floats) -> Floats:
-        """Exact integrals along lines through ``point`` with unit ``direction``, both ``(..., 3)`` mm (x, y, z)."""
+        """Exact integrals along lines through ``point`` with unit ``direction``, both ``(...,
+        3)`` mm (x, y, z)."""
         center, matrix = self._frame
         a = direction @ matrix.T
         b = (point - center) @ matrix.T
@@ -71,7 +79,8 @@ class Ellipsoid(_Body):
     """A uniform ellipse or ellipsoid.
 
     Args:
-        center: ``(y, x)`` or ``(z, y, x)`` mm. A 2-D body in a cone beam is an endless cylinder along z.
+        center: ``(y, x)`` or ``(z, y, x)`` mm. A 2-D body in a cone beam is an endless cylinder
+            along z.
         radii: semi-axes in the order of ``center``, mm, one number or one per axis.
         angle: rotation about z, rad, counter-clockwise from x to y.
         value: added value inside, mm⁻¹.
@@ -85,7 +94,8 @@ class Ellipsoid(_Body):
 
 
 class Gaussian(_Body):
-    """A Gaussian ``value · exp(-|M (x - c)|² / 2)``; ``radii`` are the standard deviations. See :class:`Ellipsoid`."""
+    """A Gaussian ``value · exp(-|M (x - c)|² / 2)``; ``radii`` are the standard deviations. See
+    :class:`Ellipsoid`."""
 
     def _chord(self, aa: Floats, ab: Floats, bb: Floats) -> Floats:
         return np.sqrt(2.0 * math.pi / aa) * np.exp(-0.5 * (bb - ab * ab / aa))
@@ -124,7 +134,10 @@ def _view_lines(
 
 
 def line_integrals(
-    geometry: Geometry, bodies: Sequence[_Body], window: DetectorWindow | None = None, sub: int | tuple[int, int] = 4
+    geometry: Geometry,
+    bodies: Sequence[_Body],
+    window: DetectorWindow | None = None,
+    sub: int | tuple[int, int] = 4,
 ) -> Floats:
     """Line integrals of ``bodies``, averaged over each cell.
 
@@ -143,18 +156,25 @@ def line_integrals(
     columns = geometry.columns if window is None else window.columns
     out = np.empty((geometry.views, rows, columns))
     sub_rows = 1 if plane else per[0]
-    for view, (point, direction) in enumerate(_view_lines(geometry, window, (sub_rows, per[1]), plane)):
+    for view, (point, direction) in enumerate(
+        _view_lines(geometry, window, (sub_rows, per[1]), plane)
+    ):
         total = sum(body.along(point, direction) for body in bodies)
         out[view] = np.asarray(total).reshape(rows, sub_rows, columns, per[1]).mean(axis=(1, 3))
     return out[:, 0] if plane else out
 
 
 def vector_lines(geometry: VectorGeometry, bodies: Sequence[_Body], sub: int = 4) -> Floats:
-    """The same along the rays that a scan's vectors describe; ``(views, [rows,] columns)`` float64."""
+    """The same along the rays that a scan's vectors describe; ``(views, [rows,] columns)``
+    float64."""
     poses, rows = geometry.poses, geometry.rows or 1
     offset = (np.arange(sub) - (sub - 1) / 2) / sub
     columns = ((np.arange(geometry.columns) - (geometry.columns - 1) / 2)[:, None] + offset).ravel()
-    heights = np.zeros(1) if geometry.rows is None else ((np.arange(rows) - (rows - 1) / 2)[:, None] + offset).ravel()
+    heights = (
+        np.zeros(1)
+        if geometry.rows is None
+        else ((np.arange(rows) - (rows - 1) / 2)[:, None] + offset).ravel()
+    )
     out = np.empty((geometry.views, heights.size, columns.size))
     for view, (source, centre, u, v) in enumerate(poses):
         cell = centre + columns[:, None] * u + heights[:, None, None] * v
@@ -166,8 +186,11 @@ def vector_lines(geometry: VectorGeometry, bodies: Sequence[_Body], sub: int = 4
 
 
 def rasterize(grid: VolumeGrid, bodies: Sequence[_Body], sub: int = 1) -> Floats:
-    """``bodies`` on the grid, averaged over ``sub`` sample points per axis in each voxel, float64."""
-    fine = VolumeGrid(tuple(n * sub for n in grid.shape), tuple(s / sub for s in grid.spacing), grid.center)
+    """``bodies`` on the grid, averaged over ``sub`` sample points per axis in each voxel,
+    float64."""
+    fine = VolumeGrid(
+        tuple(n * sub for n in grid.shape), tuple(s / sub for s in grid.spacing), grid.center
+    )
     y, x = fine.axes[-2:]
     out = np.empty(grid.shape)
     z = fine.axes[0] if grid.ndim == 3 else np.zeros(sub)
@@ -178,5 +201,7 @@ def rasterize(grid: VolumeGrid, bodies: Sequence[_Body], sub: int = 1) -> Floats
         for level in levels:
             for body in bodies:
                 total += body.at(np.asarray(level), y[:, None], x)
-        flat[k] = total.reshape(grid.shape[-2], sub, grid.shape[-1], sub).mean(axis=(1, 3)) / len(levels)
+        flat[k] = total.reshape(grid.shape[-2], sub, grid.shape[-1], sub).mean(axis=(1, 3)) / len(
+            levels
+        )
     return out

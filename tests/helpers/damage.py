@@ -1,8 +1,9 @@
-"""Files that went wrong: cut off, bits flipped, sections swapped or zeroed; and what a reader makes of them.
+"""Files that went wrong: cut off, bits flipped, sections swapped or zeroed; and what a reader makes
+of them.
 
-As a program it reads damaged copies of one file in a process of its own, so that a crash or a hang is seen from
-outside: ``python damage.py READER FOLDER COPIES [SECONDS [SEED]]`` prints a JSON object of outcomes. With SECONDS it
-stops when they are over; COPIES is then the largest number.
+As a program it reads damaged copies of one file in a process of its own, so that a crash or a hang
+is seen from outside: ``python damage.py READER FOLDER COPIES [SECONDS [SEED]]`` prints a JSON
+object of outcomes. With SECONDS it stops when they are over; COPIES is then the largest number.
 """
 
 import collections
@@ -24,8 +25,8 @@ SECONDS = 60
 
 
 def damaged(content: bytes, copies: int, seed: int = 0) -> Iterator[bytes]:
-    """Copies of a file, in turn: cut off; bits flipped in the first kilobyte; bits flipped anywhere; two sections
-    swapped; a section of zeros."""
+    """Copies of a file, in turn: cut off; bits flipped in the first kilobyte; bits flipped
+    anywhere; two sections swapped; a section of zeros."""
     rng, n = np.random.default_rng(seed), len(content)
     for k in range(copies):
         broken = bytearray(content)
@@ -39,7 +40,10 @@ def damaged(content: bytes, copies: int, seed: int = 0) -> Iterator[bytes]:
                     broken[at] ^= 1 << int(rng.integers(0, 8))
             case 3:
                 size = min(size, int(b - a))
-                broken[a : a + size], broken[b : b + size] = content[b : b + size], content[a : a + size]
+                broken[a : a + size], broken[b : b + size] = (
+                    content[b : b + size],
+                    content[a : a + size],
+                )
             case _:
                 broken[a : a + size] = bytes(size)
         yield bytes(broken)
@@ -52,7 +56,9 @@ def _volume(ending: str) -> Callable[[Path], tuple[Path, Callable[[], Any]]]:
         from torchpcct import Volume, VolumeGrid
 
         target = folder / f"v{ending}"
-        data = torch.round(300 * torch.randn((4, 12, 10), generator=torch.Generator().manual_seed(0)))
+        data = torch.round(
+            300 * torch.randn((4, 12, 10), generator=torch.Generator().manual_seed(0))
+        )
         Volume(data, VolumeGrid((4, 12, 10), (1.5, 0.5, 0.25), (3.0, -7.0, 11.0))).save(target)
 
         def read() -> list[Any]:
@@ -108,9 +114,15 @@ def _stack(part: str) -> Callable[[Path], tuple[Path, Callable[[], Any]]]:
         if part == "npy":
             np.save(folder / "all.npy", values)
         else:
-            tifffile.imwrite(folder / "all.tif", values, compression="zlib" if part == "zlib" else None)
-        text = {"readings": "all.npy" if part == "npy" else "all.tif", "kind": "counts", "air": 5e4,
-                "geometry": geometry_values(cone)}  # fmt: skip
+            tifffile.imwrite(
+                folder / "all.tif", values, compression="zlib" if part == "zlib" else None
+            )
+        text = {
+            "readings": "all.npy" if part == "npy" else "all.tif",
+            "kind": "counts",
+            "air": 5e4,
+            "geometry": geometry_values(cone),
+        }
         (folder / "scan.yaml").write_text(yaml.safe_dump(text), encoding="utf-8")
         path = folder / ("scan.yaml" if part == "yaml" else text["readings"])
         return path, lambda: _scan(open_scan(folder / "scan.yaml"))
@@ -186,7 +198,9 @@ def _rtk(folder: Path) -> tuple[Path, Callable[[], Any]]:
         c, s = math.cos(angle), math.sin(angle)
         turn = np.array([[c, 0, -s, 0], [0, 1, 0, 0], [s, 0, c, -300.0], [0, 0, 0, 1]])
         matrix = np.array([[-500.0, 0, 0, 0], [0, -500.0, 0, 0], [0, 0, 1, 0]]) @ turn
-        parts.append(f"<Projection><Matrix>{' '.join(map(str, matrix.ravel()))}</Matrix></Projection>")
+        parts.append(
+            f"<Projection><Matrix>{' '.join(map(str, matrix.ravel()))}</Matrix></Projection>"
+        )
     path = folder / "geometry.xml"
     path.write_text(
         f"<RTKGeometry><SourceToDetectorDistance>500</SourceToDetectorDistance>{''.join(parts)}</RTKGeometry>"
@@ -200,7 +214,12 @@ def _weights(folder: Path) -> tuple[Path, Callable[[], Any]]:
     from recon.mbir.weights_io import read_tensors, write_tensors
 
     path = folder / "w.safetensors"
-    write_tensors(path, "test weights", {"a": torch.arange(300.0), "b": torch.ones(2, 3)}, {"network": {"width": 3}})
+    write_tensors(
+        path,
+        "test weights",
+        {"a": torch.arange(300.0), "b": torch.ones(2, 3)},
+        {"network": {"width": 3}},
+    )
 
     def read() -> list[Any]:
         tensors, config = read_tensors(path, "test weights")
@@ -210,16 +229,32 @@ def _weights(folder: Path) -> tuple[Path, Callable[[], Any]]:
 
 
 READERS: dict[str, Callable[[Path], tuple[Path, Callable[[], Any]]]] = {
-    "scan": _own, "data exchange": _data_exchange, "npy": _stack("npy"), "tiff": _stack("tiff"),
-    "tiff zlib": _stack("zlib"), "yaml": _stack("yaml"), "catsim": _catsim, "ct-pd": _clinical, "rtk": _rtk,
-    "weights": _weights, "h5": _volume(".h5"), "nii": _volume(".nii"), "nii.gz": _volume(".nii.gz"),
-    "mha": _volume(".mha"), "dicom": _volume(""), "nexus": _nexus, "xtekct": _laboratory("xtekct"),
-    "txrm": _laboratory("txrm"), "mat": _laboratory("mat"), "zarr chunk": _zarr("0/c/0/0/0"),
+    "scan": _own,
+    "data exchange": _data_exchange,
+    "npy": _stack("npy"),
+    "tiff": _stack("tiff"),
+    "tiff zlib": _stack("zlib"),
+    "yaml": _stack("yaml"),
+    "catsim": _catsim,
+    "ct-pd": _clinical,
+    "rtk": _rtk,
+    "weights": _weights,
+    "h5": _volume(".h5"),
+    "nii": _volume(".nii"),
+    "nii.gz": _volume(".nii.gz"),
+    "mha": _volume(".mha"),
+    "dicom": _volume(""),
+    "nexus": _nexus,
+    "xtekct": _laboratory("xtekct"),
+    "txrm": _laboratory("txrm"),
+    "mat": _laboratory("mat"),
+    "zarr chunk": _zarr("0/c/0/0/0"),
     "zarr metadata": _zarr("zarr.json"),
-}  # fmt: skip
+}
 """File to damage and how it is read, made in a folder."""
 SEALED = ("scan", "weights", "h5", "zarr chunk", "zarr metadata")
-"""Our own formats, which carry a checksum: what they give is what was written, or an error that names the file."""
+"""Our own formats, which carry a checksum: what they give is what was written, or an error that
+names the file."""
 
 
 def _same(a: Any, b: Any) -> bool:
@@ -239,9 +274,12 @@ def _hang(*_: Any) -> None:
     raise _Slow
 
 
-def outcomes(name: str, folder: Path, copies: int, seed: int = 0, seconds: float = math.inf) -> dict[str, int]:
-    """How often each of ``same``, ``other`` (data that a format without checksum cannot tell from true ones),
-    ``refused`` (a clear error) and anything worse, by its name and the number of the copy."""
+def outcomes(
+    name: str, folder: Path, copies: int, seed: int = 0, seconds: float = math.inf
+) -> dict[str, int]:
+    """How often each of ``same``, ``other`` (data that a format without checksum cannot tell from
+    true ones), ``refused`` (a clear error) and anything worse, by its name and the number of the
+    copy."""
     path, read = READERS[name](folder)
     content, truth = path.read_bytes(), read()
     found: collections.Counter[str] = collections.Counter()

@@ -1,4 +1,5 @@
-"""A tilted vessel with a fibrous layer and a core, averaged over voxels by brute force, and its noise-free data.
+"""A tilted vessel with a fibrous layer and a core, averaged over voxels by brute force, and its
+noise-free data.
 
 Data are projected from voxels of half the size: what is fitted must not share its painting."""
 
@@ -17,22 +18,33 @@ from torchpcct import Projector, VolumeGrid
 
 VALUES = {"fat": -90.0, "wall": 50.0, "fibrous": 100.0, "lumen": 400.0}
 TILT = 0.15
-LUMEN_MM, INNER_MM, WALL_MM = 1.1, 1.6, 0.2
-LUMEN_OFF, CORE_OFF, CORE_MM = -0.3, 1.15, (0.35, 0.8, 0.9)
+LUMEN_MM = 1.1
+INNER_MM = 1.6
+WALL_MM = 0.2
+LUMEN_OFF = -0.3
+CORE_OFF = 1.15
+CORE_MM = (0.35, 0.8, 0.9)
 
 
-HARD_AT, HARD_MM = (0.75, 1.1), (0.25, 0.2, 0.6)
+HARD_AT = (0.75, 1.1)
+HARD_MM = (0.25, 0.2, 0.6)
 
 
 def labels(points, cores=(0.0,)):
-    """0 fat, 1 wall, 2 fibrous, 3 lumen, 4 core, 5 calcification at points (z, y, x) about the inset's centre; the axis
-    tilts in y, ``cores`` are positions along it in mm."""
+    """0 fat, 1 wall, 2 fibrous, 3 lumen, 4 core, 5 calcification at points (z, y, x) about the
+    inset's centre; the axis tilts in y, ``cores`` are positions along it in mm."""
     z, y, x = np.moveaxis(points, -1, 0)
     across, along = (y - TILT * z) / np.hypot(1, TILT), (z + TILT * y) / np.hypot(1, TILT)
     out = (np.hypot(across, x) < INNER_MM + WALL_MM).astype(int)
     out[np.hypot(across, x) < INNER_MM] = 2
     for middle in cores:
-        core = sum((v / s) ** 2 for v, s in zip((x - CORE_OFF, across, along - middle), CORE_MM, strict=True)) < 1
+        core = (
+            sum(
+                (v / s) ** 2
+                for v, s in zip((x - CORE_OFF, across, along - middle), CORE_MM, strict=True)
+            )
+            < 1
+        )
         out[core & (out == 2)] = 4
     out[np.hypot(across, x - LUMEN_OFF) < LUMEN_MM] = 3
     off = (x - HARD_AT[0], across + HARD_AT[1], along - 1.0)
@@ -42,9 +54,11 @@ def labels(points, cores=(0.0,)):
 
 
 def image(grid, contrast, samples=5, hard=0.0, cores=(0.0,), **values):
-    """``grid.shape`` HU; the core is ``contrast`` HU below the fibrous tissue, the calcification ``hard`` above it;
-    ``values`` are of other tissues than :data:`VALUES`."""
-    table = np.array([*{**VALUES, **values}.values(), VALUES["fibrous"] - contrast, VALUES["fibrous"] + hard])
+    """``grid.shape`` HU; the core is ``contrast`` HU below the fibrous tissue, the calcification
+    ``hard`` above it; ``values`` are of other tissues than :data:`VALUES`."""
+    table = np.array(
+        [*{**VALUES, **values}.values(), VALUES["fibrous"] - contrast, VALUES["fibrous"] + hard]
+    )
     axes = [a - c for a, c in zip(grid.axes, grid.center, strict=True)]
     sub = (np.arange(samples) + 0.5) / samples - 0.5
     out = np.zeros(grid.shape)
@@ -52,13 +66,17 @@ def image(grid, contrast, samples=5, hard=0.0, cores=(0.0,), **values):
         for dy in sub:
             for dx in sub:
                 shift = np.array([dz, dy, dx]) * grid.spacing
-                points = np.stack(np.meshgrid(*(a + d for a, d in zip(axes, shift, strict=True)), indexing="ij"), -1)
+                points = np.stack(
+                    np.meshgrid(*(a + d for a, d in zip(axes, shift, strict=True)), indexing="ij"),
+                    -1,
+                )
                 out += table[labels(points, cores)]
     return torch.from_numpy(out / samples**3).float()
 
 
 def operator(shape=(26, 24, 24), voxel=0.3):
-    """Gram operator of a scan in which a core stands out of the noise; its ``statistic`` takes ``finer`` voxels."""
+    """Gram operator of a scan in which a core stands out of the noise; its ``statistic`` takes
+    ``finer`` voxels."""
     A, w = problem(views=120, shape=shape, voxel=voxel, rows=32)
     gram = Gram(A, w, 5).scaled(200.0)
     gram.finer = VolumeGrid(tuple(2 * n for n in shape), voxel / 2, A.grid.center)
@@ -82,14 +100,16 @@ def inset():
 
 
 def statistic(drawn, seen, seed, exposure_s=1.0):
-    """``(1, z, y, x)`` b of HU on ``gram.finer`` in an :func:`inset`; noise of a seed, None: without noise."""
+    """``(1, z, y, x)`` b of HU on ``gram.finer`` in an :func:`inset`; noise of a seed, None:
+    without noise."""
     noise = 0.0 if seed is None else drawn.gram.noise(generator=torch.Generator().manual_seed(seed))
     clean = drawn.gram.statistic((seen / 1000.0 + 1.0) * drawn.mu_ref - drawn.level)
     return (exposure_s * clean + exposure_s**0.5 * noise)[None]
 
 
 def untrained():
-    """MBIR of an untrained network: the linear start, the data's low frequencies; nothing is put back."""
+    """MBIR of an untrained network: the linear start, the data's low frequencies; nothing is put
+    back."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         model = Unrolled(NetworkConfig((6, 8, 8), 0.3), 2)

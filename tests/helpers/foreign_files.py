@@ -10,7 +10,8 @@ import numpy as np
 
 
 def data_exchange(path: Path, data, white, angles, dark=None, pixel_um=None, **storage) -> Path:
-    """A scan as beamlines write it: uint16 frames ``(views, rows, columns)``, theta in degrees, pixel size in µm."""
+    """A scan as beamlines write it: uint16 frames ``(views, rows, columns)``, theta in degrees,
+    pixel size in µm."""
     with h5py.File(path, "w") as file:
         file.create_dataset("exchange/data", data=np.rint(data).astype(np.uint16), **storage)
         file["exchange/data_white"] = np.asarray(white).astype(np.uint16)
@@ -24,8 +25,11 @@ def data_exchange(path: Path, data, white, angles, dark=None, pixel_um=None, **s
     return path
 
 
-def ct_pd(folder: Path, lines, geometry, climb: float = 0.0, spot: str = "FFSNONE", shifts=None) -> Path:
-    """A folder of DICOM-CT-PD: focal spot at (−ρ sin φ, ρ cos φ), element i at φ + (i − i₀)Δ / d; water 0.02 mm⁻¹.
+def ct_pd(
+    folder: Path, lines, geometry, climb: float = 0.0, spot: str = "FFSNONE", shifts=None
+) -> Path:
+    """A folder of DICOM-CT-PD: focal spot at (−ρ sin φ, ρ cos φ), element i at φ + (i − i₀)Δ / d;
+    water 0.02 mm⁻¹.
 
     ``shifts``: deflections (angle in rad, height and radius in mm) that the views have in turn.
     """
@@ -49,23 +53,36 @@ def ct_pd(folder: Path, lines, geometry, climb: float = 0.0, spot: str = "FFSNON
         for group in (0x7029, 0x7031, 0x7033, 0x7041):
             d.add_new((group, 0x10), "LO", "DICOM-CT-PD")
         for tag, vr, value in (
-            (0x70291002, "FL", g.pitch[1]), (0x70291006, "FL", g.pitch[0]), (0x7029100B, "CS", "CYLINDRICAL"),
-            (0x70291010, "US", rows), (0x70291011, "US", n), (0x70311001, "FL", g.angles[k] - math.pi / 2),
-            (0x70311002, "FL", climb * k), (0x70311003, "FL", g.sod), (0x70311031, "FL", g.sdd),
-            (0x70311033, "FL", list(centre)), (0x7033100E, "CS", spot), (0x70411001, "DS", "0.02"),
-        ):  # fmt: skip
+            (0x70291002, "FL", g.pitch[1]),
+            (0x70291006, "FL", g.pitch[0]),
+            (0x7029100B, "CS", "CYLINDRICAL"),
+            (0x70291010, "US", rows),
+            (0x70291011, "US", n),
+            (0x70311001, "FL", g.angles[k] - math.pi / 2),
+            (0x70311002, "FL", climb * k),
+            (0x70311003, "FL", g.sod),
+            (0x70311031, "FL", g.sdd),
+            (0x70311033, "FL", list(centre)),
+            (0x7033100E, "CS", spot),
+            (0x70411001, "DS", "0.02"),
+        ):
             d.add_new(tag, vr, value)
         if shifts is not None:
-            for tag, value in zip((0x7033100B, 0x7033100C, 0x7033100D), shifts[k % len(shifts)], strict=True):
+            for tag, value in zip(
+                (0x7033100B, 0x7033100C, 0x7033100D), shifts[k % len(shifts)], strict=True
+            ):
                 d.add_new(tag, "FL", value)
         d.PixelData = np.rint((view[:, ::-1].T + 0.1) / 0.0001).astype("<u2").tobytes()
-        d.save_as(folder / f"{len(lines) - k:04d}.dcm", enforce_file_format=True)  # names in the other order
+        # names in the other order
+        d.save_as(folder / f"{len(lines) - k:04d}.dcm", enforce_file_format=True)
     return folder
 
 
-def nexus(path: Path, data, white, angles, dark=None, pixel_um=None, unit="deg", times=None) -> Path:
-    """An NXtomo file as beamlines write it: darks, flats, projections and flats again in one data set, keys, angles of
-    all frames, and NXdata with soft links."""
+def nexus(
+    path: Path, data, white, angles, dark=None, pixel_um=None, unit="deg", times=None
+) -> Path:
+    """An NXtomo file as beamlines write it: darks, flats, projections and flats again in one data
+    set, keys, angles of all frames, and NXdata with soft links."""
     darks = [] if dark is None else list(dark)
     half = len(white) // 2
     frames = [*darks, *white[:half], *data, *white[half:]]
@@ -93,7 +110,8 @@ def nexus(path: Path, data, white, angles, dark=None, pixel_um=None, unit="deg",
 
 
 def xtekct(folder: Path, readings, geometry, white: float, start: float = 30.0, **more) -> Path:
-    """A Nikon scan: uint16 images from behind the detector, top row first, of views that count as the object turns.
+    """A Nikon scan: uint16 images from behind the detector, top row first, of views that count as
+    the object turns.
 
     The geometry's first angle must be ``start`` + 90°.
     """
@@ -101,33 +119,58 @@ def xtekct(folder: Path, readings, geometry, white: float, start: float = 30.0, 
 
     folder.mkdir()
     for k, view in enumerate(readings):
-        tifffile.imwrite(folder / f"part_{k + 1:04d}.tif", np.rint(view[::-1, ::-1]).astype(np.uint16))
+        tifffile.imwrite(
+            folder / f"part_{k + 1:04d}.tif", np.rint(view[::-1, ::-1]).astype(np.uint16)
+        )
     g = geometry
     values = {
-        "Name": "part", "InputSeparator": "_", "InputFolderName": "", "SrcToObject": g.sod, "SrcToDetector": g.sdd,
-        "DetectorPixelsX": g.columns, "DetectorPixelsY": g.rows, "DetectorPixelSizeX": g.pitch[1],
-        "DetectorPixelSizeY": g.pitch[0], "CentreOfRotationTop": g.offset[1], "CentreOfRotationBottom": g.offset[1],
-        "InitialAngle": start, "AngularStep": 360.0 / g.views, "Projections": g.views, "WhiteLevel": white, **more,
-    }  # fmt: skip
+        "Name": "part",
+        "InputSeparator": "_",
+        "InputFolderName": "",
+        "SrcToObject": g.sod,
+        "SrcToDetector": g.sdd,
+        "DetectorPixelsX": g.columns,
+        "DetectorPixelsY": g.rows,
+        "DetectorPixelSizeX": g.pitch[1],
+        "DetectorPixelSizeY": g.pitch[0],
+        "CentreOfRotationTop": g.offset[1],
+        "CentreOfRotationBottom": g.offset[1],
+        "InitialAngle": start,
+        "AngularStep": 360.0 / g.views,
+        "Projections": g.views,
+        "WhiteLevel": white,
+        **more,
+    }
     text = "[XTekCT]\r\n" + "".join(f"{name}={value}\r\n" for name, value in values.items())
-    (folder / "part.xtekct").write_bytes(b"\xef\xbb\xbf" + f"{text}[Xrays]\r\nXraykV=120\r\n".encode())
+    (folder / "part.xtekct").write_bytes(
+        b"\xef\xbb\xbf" + f"{text}[Xrays]\r\nXraykV=120\r\n".encode()
+    )
     return folder / "part.xtekct"
 
 
 def txrm(path: Path, readings, geometry, air, shifts=None) -> Path:
-    """A Zeiss scan of a cone beam that turns clockwise from −90°: uint16 images, a float reference, mm and µm."""
+    """A Zeiss scan of a cone beam that turns clockwise from −90°: uint16 images, a float
+    reference, mm and µm."""
     g = geometry
     degrees = -np.rad2deg(g.angles) - 90.0
     voxel = 1e3 * g.pitch[1] * g.sod / g.sdd
     streams = {
-        "ImageInfo/ImageWidth": np.uint32(g.columns), "ImageInfo/ImageHeight": np.uint32(g.rows),
-        "ImageInfo/NoOfImages": np.uint32(g.views), "ImageInfo/DataType": np.uint32(5),
-        "ImageInfo/Angles": degrees.astype("<f4"), "ImageInfo/PixelSize": np.float32(voxel),
+        "ImageInfo/ImageWidth": np.uint32(g.columns),
+        "ImageInfo/ImageHeight": np.uint32(g.rows),
+        "ImageInfo/NoOfImages": np.uint32(g.views),
+        "ImageInfo/DataType": np.uint32(5),
+        "ImageInfo/Angles": degrees.astype("<f4"),
+        "ImageInfo/PixelSize": np.float32(voxel),
         "ImageInfo/StoRADistance": np.full(g.views, -g.sod, "<f4"),
-        "ImageInfo/DtoRADistance": np.full(g.views, g.sdd - g.sod, "<f4"), "ImageInfo/XrayGeometry": np.int32(1),
-        "ReferenceData/DataType": np.uint32(10), "ReferenceData/Image": np.asarray(air, "<f4"),
-        **{f"ImageData{k // 100 + 1}/Image{k + 1}": np.rint(v).astype("<u2") for k, v in enumerate(readings)},
-    }  # fmt: skip
+        "ImageInfo/DtoRADistance": np.full(g.views, g.sdd - g.sod, "<f4"),
+        "ImageInfo/XrayGeometry": np.int32(1),
+        "ReferenceData/DataType": np.uint32(10),
+        "ReferenceData/Image": np.asarray(air, "<f4"),
+        **{
+            f"ImageData{k // 100 + 1}/Image{k + 1}": np.rint(v).astype("<u2")
+            for k, v in enumerate(readings)
+        },
+    }
     for axis, values in (shifts or {}).items():
         streams[f"alignment/{axis}-shifts"] = np.asarray(values, "<f4")
     compound_file(path, {name: np.asarray(values).tobytes() for name, values in streams.items()})
@@ -135,7 +178,8 @@ def txrm(path: Path, readings, geometry, air, shifts=None) -> Path:
 
 
 def compound_file(path: Path, streams: dict[str, bytes]) -> None:
-    """A compound file (OLE, [MS-CFB] version 3) of streams in storages: what ``olefile`` reads and does not write."""
+    """A compound file (OLE, [MS-CFB] version 3) of streams in storages: what ``olefile`` reads
+    and does not write."""
     end, free, no = 0xFFFFFFFE, 0xFFFFFFFF, 0xFFFFFFFF
     entries, children = [["Root Entry", 5, no, no, no, end, 0]], {}
     for name in streams:
@@ -189,13 +233,18 @@ def compound_file(path: Path, streams: dict[str, bytes]) -> None:
         + bytes(16 + 4 + 16)
         + struct.pack("<IQ", start, size)
         for name, kind, left, right, child, start, size in entries
-    )  # fmt: skip
+    )
     directory_at = put(directory.ljust(-(-len(directory) // 512) * 512, b"\0"))
     n = next(n for n in range(1, 109) if 128 * n >= len(fat) + n)
     fat_at = len(sectors)
     fat += [0xFFFFFFFD] * n
     fat += [free] * (128 * n - len(fat))
-    header = bytes.fromhex("d0cf11e0a1b11ae1") + bytes(16) + struct.pack("<HHHHH", 0x3E, 3, 0xFFFE, 9, 6) + bytes(6)
+    header = (
+        bytes.fromhex("d0cf11e0a1b11ae1")
+        + bytes(16)
+        + struct.pack("<HHHHH", 0x3E, 3, 0xFFFE, 9, 6)
+        + bytes(6)
+    )
     header += struct.pack("<IIIIIIIII", 0, n, directory_at, 0, 4096, minifat_at, minifat_n, end, 0)
     header += np.array([*range(fat_at, fat_at + n), *[free] * (109 - n)], "<u4").tobytes()
     path.write_bytes(header + b"".join(sectors) + np.array(fat, "<u4").tobytes())

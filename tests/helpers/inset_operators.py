@@ -1,4 +1,5 @@
-"""An off-centre inset of the deep-silicon scanner as an operator with weights, its dense matrix, and a tissue in it."""
+"""An off-centre inset of the deep-silicon scanner as an operator with weights, its dense matrix,
+and a tissue in it."""
 
 import math
 
@@ -14,12 +15,17 @@ CENTER = (0.0, -30.38, -29.63)
 
 
 def problem(views=240, shape=(8, 13, 13), voxel=0.4, rows=10, dtype=torch.float32, window=True):
-    """An off-centre inset of the deep-silicon scanner, with weights that change smoothly over views and columns."""
+    """An off-centre inset of the deep-silicon scanner, with weights that change smoothly over
+    views and columns."""
     geometry = ConeBeam(full_turn(views), 626.0, 1098.0, 1500, rows, (0.5, 0.35), detector="curved")
     grid = VolumeGrid(shape, voxel, CENTER)
     part = footprint(geometry, grid, margin=1)
     A = Projector(geometry, grid, part if window else None)
-    gamma = geometry.fan_angles[part.column_indices] if window else geometry.fan_angles[None].repeat(views, 0)
+    gamma = (
+        geometry.fan_angles[part.column_indices]
+        if window
+        else geometry.fan_angles[None].repeat(views, 0)
+    )
     path = 2 * np.sqrt(120.0**2 - (626.0 * np.sin(np.clip(gamma, -0.17, 0.17))) ** 2)
     w = torch.from_numpy(115 * np.exp(0.0185 * (240 - path)))[:, None]
     return A, w.expand(A.range_shape).to(dtype).contiguous()
@@ -37,7 +43,8 @@ def dense(A):
 
 
 def minimum(H, b, bound, shape, step, start=None):
-    """Of ½ xᵀHx − bᵀx and a prior, by float64 matrices: majorise and minimise until the steps are below ``step``.
+    """Of ½ xᵀHx − bᵀx and a prior, by float64 matrices: majorise and minimise until the steps are
+    below ``step``.
 
     The energy is convex: a start near the end only saves time.
     """
@@ -54,6 +61,8 @@ def minimum(H, b, bound, shape, step, start=None):
 
 
 def tissue(grid):
-    _, y, x = np.meshgrid(*(a - c for a, c in zip(grid.axes, grid.center, strict=True)), indexing="ij")
+    _, y, x = np.meshgrid(
+        *(a - c for a, c in zip(grid.axes, grid.center, strict=True)), indexing="ij"
+    )
     tube = 160.0 * (np.hypot(y, x - 0.3) < 1.7) + 400.0 * (np.hypot(y, x + 0.4) < 1.0)
     return torch.from_numpy(tube * HU).float()

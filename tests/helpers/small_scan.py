@@ -1,4 +1,5 @@
-"""A ball of fibrous tissue in fat, and a scanner of few views and rows: a scan that tests can afford."""
+"""A ball of fibrous tissue in fat, and a scanner of few views and rows: a scan that tests can
+afford."""
 
 from dataclasses import replace
 
@@ -18,5 +19,8 @@ def scanner(mode="counting", views=120, rows=12):
 
 BALL = Ellipsoid((1.6, 1.6, 1.2), position=CENTER[::-1])
 SCENE = Scene(
-    [Body("patient", EllipticCylinder(120.0), "pericoronary_fat"), Body("ball", BALL, "fibrous_tissue", "patient")]
+    [
+        Body("patient", EllipticCylinder(120.0), "pericoronary_fat"),
+        Body("ball", BALL, "fibrous_tissue", "patient"),
+    ]
 )

@@ -95,4 +95,8 @@ def threads(folder):
 
     from torchpcct.threads import get_num_threads
 
-    return torch.get_num_threads(), get_num_threads(), max(pool["num_threads"] for pool in threadpool_info())
+    return (
+        torch.get_num_threads(),
+        get_num_threads(),
+        max(pool["num_threads"] for pool in threadpool_info()),
+    )

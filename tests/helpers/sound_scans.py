@@ -1,8 +1,10 @@
-"""Sound scans drawn at random: no check may find anything wrong with them, and wrong ones are made of them.
+"""Sound scans drawn at random: no check may find anything wrong with them, and wrong ones are made
+of them.
 
-Nothing here knows of the package's projector: chords of ellipsoids, elliptic cylinders and boxes are exact, each cell
-averages the transmissions of rays spread over it (and, of some scans, over the focal spot and the arc that a view
-takes), the photons have Poisson noise. A seed tells all of a scan.
+Nothing here knows of the package's projector: chords of ellipsoids, elliptic cylinders and boxes
+are exact, each cell averages the transmissions of rays spread over it (and, of some scans, over the
+focal spot and the arc that a view takes), the photons have Poisson noise. A seed tells all of a
+scan.
 """
 
 import math
@@ -19,7 +21,9 @@ from torchpcct.scan import Scan
 __all__ = ["KINDS", "Drawn", "Solid", "draw", "transmissions"]
 
 Floats = NDArray[np.float64]
-BALL, CYLINDER, BOX = 0, 1, 2
+BALL = 0
+CYLINDER = 1
+BOX = 2
 KINDS = ("parallel", "fan", "cone")
 
 
@@ -45,7 +49,12 @@ class Solid:
     @property
     def numbers(self) -> list[float]:
         """Shape, centre, value and the nine numbers of the matrix to the unit body."""
-        c, s, a, b = math.cos(self.turn), math.sin(self.turn), math.cos(self.tilt), math.sin(self.tilt)
+        c, s, a, b = (
+            math.cos(self.turn),
+            math.sin(self.turn),
+            math.cos(self.tilt),
+            math.sin(self.tilt),
+        )
         about_z = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         about_x = np.array([[1.0, 0.0, 0.0], [0.0, a, b], [0.0, -b, a]])
         matrix = (about_z @ about_x) / np.array(self.radii)[:, None]
@@ -62,7 +71,11 @@ def _chord(body, px, py, pz, dx, dy, dz):  # type: ignore[no-untyped-def]  # pra
     by = body[8] * qx + body[9] * qy + body[10] * qz
     bz = body[11] * qx + body[12] * qy + body[13] * qz
     if body[0] == 0.0:
-        aa, ab, bb = ax * ax + ay * ay + az * az, ax * bx + ay * by + az * bz, bx * bx + by * by + bz * bz
+        aa, ab, bb = (
+            ax * ax + ay * ay + az * az,
+            ax * bx + ay * by + az * bz,
+            bx * bx + by * by + bz * bz,
+        )
         inside = ab * ab - aa * (bb - 1.0)
         return 2.0 * math.sqrt(inside) / aa if inside > 0.0 else 0.0
     low, high = -1e12, 1e12
@@ -92,10 +105,12 @@ def _chord(body, px, py, pz, dx, dy, dz):  # type: ignore[no-untyped-def]  # pra
 
 @njit(cache=True)
 def _mean_transmissions(bodies, angles, arc, u, w, pitches, subs, kind, sod, sdd, spot, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """``kind``: 0 parallel, 1 flat, 2 curved; ``subs``: rays a cell along columns, rows and the arc of a view."""
+    """``kind``: 0 parallel, 1 flat, 2 curved; ``subs``: rays a cell along columns, rows and the
+    arc of a view."""
     columns, rows, arcs = subs
     total = columns * rows * arcs
-    # Coprime to the number of rays, so that all parts of the focal spot have one and none is to one side.
+    # Coprime to the number of rays, so that all parts of the focal spot have one and none is to one
+    # side.
     stride = 7 if total % 7 else 11
     cosines, sines = np.empty(arcs), np.empty(arcs)
     for v in range(angles.size):
@@ -117,7 +132,11 @@ def _mean_transmissions(bodies, angles, arc, u, w, pitches, subs, kind, sod, sdd
                         # Each ray of a cell starts at another part of the focal spot.
                         shift = spot * (((stride * n) % total + 0.5) / total - 0.5)
                         px, py, pz = sod * c - shift * s, sod * s + shift * c, 0.0
-                        far, across = (sdd, at) if kind == 1 else (sdd * math.cos(at / sdd), sdd * math.sin(at / sdd))
+                        far, across = (
+                            (sdd, at)
+                            if kind == 1
+                            else (sdd * math.cos(at / sdd), sdd * math.sin(at / sdd))
+                        )
                         qx, qy = sod * c - far * c - across * s, sod * s - far * s + across * c
                         dx, dy, dz = qx - px, qy - py, height
                         length = math.sqrt(dx * dx + dy * dy + dz * dz)
@@ -130,7 +149,12 @@ def _mean_transmissions(bodies, angles, arc, u, w, pitches, subs, kind, sod, sdd
 
 
 def transmissions(
-    geometry: Any, solids: list[Solid], *, subs: tuple[int, int, int] = (3, 2, 1), arc: float = 0.0, spot: float = 0.0
+    geometry: Any,
+    solids: list[Solid],
+    *,
+    subs: tuple[int, int, int] = (3, 2, 1),
+    arc: float = 0.0,
+    spot: float = 0.0,
 ) -> Floats:
     """Transmissions averaged over cells, ``(views, [rows,] columns)``.
 
@@ -174,7 +198,8 @@ class Drawn:
         seed: of all of it.
         kind: one of :data:`KINDS`.
         text: what it is, in one line.
-        geometry, solids, photons, options: photons a cell in air; ``options`` of :func:`transmissions`.
+        geometry, solids, photons, options: photons a cell in air; ``options`` of
+            :func:`transmissions`.
         profile: relative readings in air, ``([rows,] columns)``.
         frames: of which air was measured; 0: it is known.
         electronic_noise: photons.
@@ -205,17 +230,25 @@ class Drawn:
             shone: transmissions; None: its own.
         """
         rng = np.random.default_rng([self.seed, 1])
-        shone = transmissions(self.geometry, self.solids, **self.options) if shone is None else shone
+        shone = (
+            transmissions(self.geometry, self.solids, **self.options) if shone is None else shone
+        )
         air = np.broadcast_to(self.photons * self.profile, shone.shape[1:])
         counts = rng.poisson(air * shone).astype(np.float64)
-        measured = rng.poisson(air, (self.frames, *air.shape)).astype(np.float64) if self.frames else air
+        measured = (
+            rng.poisson(air, (self.frames, *air.shape)).astype(np.float64) if self.frames else air
+        )
         extra: dict[str, Any] = {}
         if self.electronic_noise:
             extra["electronic_noise"] = self.electronic_noise
             counts += self.electronic_noise * rng.standard_normal(counts.shape)
             extra["dark"] = np.zeros(air.shape)
         return Scan.from_counts(
-            counts, self.geometry if geometry is None else geometry, air=measured, mu_water=self.mu_water, **extra
+            counts,
+            self.geometry if geometry is None else geometry,
+            air=measured,
+            mu_water=self.mu_water,
+            **extra,
         )
 
     def wrongly(self, texts: list[str]) -> list[str]:
@@ -223,7 +256,7 @@ class Drawn:
         return [text for text in texts if not any(part in text for part in self.rightly)]
 
 
-# --- what is scanned --------------------------------------------------------------------------------------------------
+# --- what is scanned ------------------------------------------------------------------------------
 
 
 def _inserts(rng: Any, count: int, reach: float, height: float, mu: float) -> list[Solid]:
@@ -239,7 +272,15 @@ def _inserts(rng: Any, count: int, reach: float, height: float, mu: float) -> li
         shape = CYLINDER if math.isinf(height) else int(rng.integers(3))
         if shape == BOX:
             radii = (0.7 * radii[0], 0.7 * radii[1], radii[2])
-        found.append(Solid(shape, (away * math.cos(way), away * math.sin(way), z), radii, value, rng.uniform(0, 3)))
+        found.append(
+            Solid(
+                shape,
+                (away * math.cos(way), away * math.sin(way), z),
+                radii,
+                value,
+                rng.uniform(0, 3),
+            )
+        )
     return found
 
 
@@ -272,7 +313,9 @@ def _object(rng: Any, fov: float, height: float, mu: float) -> tuple[str, list[S
         c = high if solid == CYLINDER else min(r, height)
         bodies = [Solid(solid, (0.0, 0.0, 0.0), (r, r, c), mu)]
         if rng.random() < 0.5:
-            bodies += _inserts(rng, int(rng.integers(1, 6)), 0.9 * r, math.inf if endless else c / 2, mu)
+            bodies += _inserts(
+                rng, int(rng.integers(1, 6)), 0.9 * r, math.inf if endless else c / 2, mu
+            )
     elif name in ("off-centre", "ellipse", "tilted"):
         a = fov * rng.uniform(0.15, 0.9)
         b = a * (1.0 if name == "off-centre" else rng.uniform(0.4, 1.0))
@@ -282,12 +325,19 @@ def _object(rng: Any, fov: float, height: float, mu: float) -> tuple[str, list[S
         if tilt:
             solid, b = BALL, min(b, 0.8 * height)
         zz = 0.0 if c > height else z(math.hypot(c, b * math.sin(tilt)))
-        bodies = [Solid(solid, (x, y, zz), (a, b, c), mu, rng.uniform(0, 3) if not tilt else 0.0, tilt)]
-        for s in _inserts(rng, int(rng.integers(0, 4)), 0.7 * min(a, b), math.inf if c > height else 0.5 * c, mu):
+        bodies = [
+            Solid(solid, (x, y, zz), (a, b, c), mu, rng.uniform(0, 3) if not tilt else 0.0, tilt)
+        ]
+        for s in _inserts(
+            rng, int(rng.integers(0, 4)), 0.7 * min(a, b), math.inf if c > height else 0.5 * c, mu
+        ):
             cx, cy, cz = s.center
             bodies.append(replace(s, center=(cx + x, cy + y, cz + zz)))
     elif name == "box":
-        a, turn = fov * rng.uniform(0.2, 0.65), float(rng.choice([0.0, 0.5 * math.pi, rng.uniform(0, 3)]))
+        a, turn = (
+            fov * rng.uniform(0.2, 0.65),
+            float(rng.choice([0.0, 0.5 * math.pi, rng.uniform(0, 3)])),
+        )
         c = min(a * rng.uniform(0.4, 1.2), 0.9 * high)
         x, y = placed(1.42 * a)
         bodies = [Solid(BOX, (x, y, z(c)), (a, a * rng.uniform(0.2, 1.0), c), mu, turn)]
@@ -296,7 +346,14 @@ def _object(rng: Any, fov: float, height: float, mu: float) -> tuple[str, list[S
         for _ in range(int(rng.integers(2, 6))):
             r = fov * rng.uniform(0.05, 0.35)
             c = 1e5 if endless else min(r * rng.uniform(0.5, 1.5), height)
-            bodies.append(Solid(solid, (*placed(r), z(c)), (r, r * rng.uniform(0.6, 1), c), mu * rng.uniform(0.3, 1.5)))
+            bodies.append(
+                Solid(
+                    solid,
+                    (*placed(r), z(c)),
+                    (r, r * rng.uniform(0.6, 1), c),
+                    mu * rng.uniform(0.3, 1.5),
+                )
+            )
     elif name == "shell":
         a, thick = fov * rng.uniform(0.5, 0.95), rng.uniform(0.03, 0.15)
         b = a * rng.uniform(0.7, 1.0)
@@ -315,8 +372,14 @@ def _object(rng: Any, fov: float, height: float, mu: float) -> tuple[str, list[S
         c = height * rng.uniform(0.08, 0.9)
         x, y = placed(a * (1.42 if shape == BOX else 1.0)) if rng.random() < 0.6 else (0.0, 0.0)
         zz = rng.uniform(-1, 1) * (height - c)
-        tilt = float(np.clip(rng.normal(0, 0.3), -1, 1)) * (height - c - abs(zz)) / a if rng.random() < 0.4 else 0.0
-        bodies = [Solid(shape, (x, y, zz), (a, a * rng.uniform(0.6, 1), c), mu, rng.uniform(0, 3), tilt)]
+        tilt = (
+            float(np.clip(rng.normal(0, 0.3), -1, 1)) * (height - c - abs(zz)) / a
+            if rng.random() < 0.4
+            else 0.0
+        )
+        bodies = [
+            Solid(shape, (x, y, zz), (a, a * rng.uniform(0.6, 1), c), mu, rng.uniform(0, 3), tilt)
+        ]
         for s in _inserts(rng, int(rng.integers(0, 4)), 0.55 * a, 0.8 * c, mu):
             cx, cy, cz = s.center
             bodies.append(replace(s, center=(cx + x, cy + y, cz + zz)))
@@ -324,8 +387,18 @@ def _object(rng: Any, fov: float, height: float, mu: float) -> tuple[str, list[S
         a = fov * rng.uniform(0.3, 0.9)
         x, y = placed(a)
         bodies = [
-            Solid(BALL, (x, y, z(height / 2)), (a, a * rng.uniform(0.6, 1), height * rng.uniform(1.5, 6)), mu),
-            Solid(BALL, (x, y, rng.uniform(-1, 1) * height), (a / 3, a / 3, a / 3), mu * rng.uniform(-1, 1)),
+            Solid(
+                BALL,
+                (x, y, z(height / 2)),
+                (a, a * rng.uniform(0.6, 1), height * rng.uniform(1.5, 6)),
+                mu,
+            ),
+            Solid(
+                BALL,
+                (x, y, rng.uniform(-1, 1) * height),
+                (a / 3, a / 3, a / 3),
+                mu * rng.uniform(-1, 1),
+            ),
         ]
     elif name == "tooth":
         a, c = fov * rng.uniform(0.3, 0.7), height * rng.uniform(0.6, 1.0)
@@ -344,15 +417,32 @@ def _object(rng: Any, fov: float, height: float, mu: float) -> tuple[str, list[S
         b = a * rng.uniform(0.7, 1)
         bodies = [
             Solid(BALL, (x, y, 0.0), (a, b, c), mu),
-            Solid(BALL, (x - 0.35 * a, y, z(0.4 * height)), (a * 0.25, b * 0.4, height * 0.4), -0.7 * mu),
-            Solid(BALL, (x + 0.35 * a, y, z(0.4 * height)), (a * 0.25, b * 0.4, height * 0.4), -0.7 * mu),
-            Solid(CYLINDER, (x, y - 0.6 * b, 0.0), (a * 0.1, a * 0.1, 0.7 * c), mu, 0.0, rng.uniform(-0.15, 0.15)),
+            Solid(
+                BALL,
+                (x - 0.35 * a, y, z(0.4 * height)),
+                (a * 0.25, b * 0.4, height * 0.4),
+                -0.7 * mu,
+            ),
+            Solid(
+                BALL,
+                (x + 0.35 * a, y, z(0.4 * height)),
+                (a * 0.25, b * 0.4, height * 0.4),
+                -0.7 * mu,
+            ),
+            Solid(
+                CYLINDER,
+                (x, y - 0.6 * b, 0.0),
+                (a * 0.1, a * 0.1, 0.7 * c),
+                mu,
+                0.0,
+                rng.uniform(-0.15, 0.15),
+            ),
         ]
     upright = ("round", "off-centre", "ellipse", "several", "shell", "box")
     return f"{name}, endless" if endless and not plane and name in upright else name, bodies
 
 
-# --- how it is scanned ------------------------------------------------------------------------------------------------
+# --- how it is scanned ----------------------------------------------------------------------------
 
 
 def _log_uniform(rng: Any, low: float, high: float) -> float:
@@ -370,18 +460,28 @@ def draw(seed: int, *, kind: str | None = None, readings: int = 600_000) -> Draw
     rng = np.random.default_rng([seed, 0])
     kind = str(rng.choice(KINDS, p=(0.2, 0.25, 0.55))) if kind is None else kind
     scale = str(rng.choice(["body", "animal", "micro"], p=(0.5, 0.25, 0.25)))
-    radius = {"body": rng.uniform(40, 200), "animal": rng.uniform(8, 30), "micro": rng.uniform(1, 8)}[scale]
+    radius = {
+        "body": rng.uniform(40, 200),
+        "animal": rng.uniform(8, 30),
+        "micro": rng.uniform(1, 8),
+    }[scale]
     cell = {
         "body": _log_uniform(rng, 1, 8),
         "animal": _log_uniform(rng, 0.2, 1),
         "micro": _log_uniform(rng, 0.05, 0.4),
     }[scale]
-    sod = {"body": rng.uniform(2.8, 5), "animal": rng.uniform(3, 10), "micro": rng.uniform(4, 20)}[scale] * radius
+    sod = {"body": rng.uniform(2.8, 5), "animal": rng.uniform(3, 10), "micro": rng.uniform(4, 20)}[
+        scale
+    ] * radius
     magnification = rng.uniform(1.3, 2.5) if scale != "micro" else rng.uniform(1.1, 6.0)
     zoom = 1.0 if kind == "parallel" else magnification
     fov = radius * rng.uniform(1.05, 1.5)
     columns = int(np.clip(2 * fov * zoom / cell, 24 if rng.random() < 0.9 else 12, 700))
-    views = int(_log_uniform(rng, 60, 1000)) if rng.random() < 0.8 else int(rng.choice([120, 180, 360, 720]))
+    views = (
+        int(_log_uniform(rng, 60, 1000))
+        if rng.random() < 0.8
+        else int(rng.choice([120, 180, 360, 720]))
+    )
     rows = int(_log_uniform(rng, 2, 80)) if kind == "cone" else 1
     while views * rows * columns > readings:
         if rows > 12:
@@ -402,7 +502,11 @@ def draw(seed: int, *, kind: str | None = None, readings: int = 600_000) -> Draw
     start = rng.uniform(-math.pi, math.pi) if rng.random() < 0.5 else 0.0
     arcs = {"turn": 2 * math.pi, "inclusive": 2 * math.pi, "over": rng.uniform(2.1, 2.6) * math.pi}
     if kind == "parallel":
-        arcs |= {"half": math.pi, "half inclusive": math.pi, "more than half": rng.uniform(1.05, 1.6) * math.pi}
+        arcs |= {
+            "half": math.pi,
+            "half inclusive": math.pi,
+            "more than half": rng.uniform(1.05, 1.6) * math.pi,
+        }
         turn = str(rng.choice(list(arcs), p=(0.35, 0.05, 0.05, 0.35, 0.1, 0.1)))
     else:
         least = (math.pi + 2 * angle) * (1 + 4.0 / views)
@@ -429,22 +533,39 @@ def draw(seed: int, *, kind: str | None = None, readings: int = 600_000) -> Draw
         g = FanBeam(angles, sod, sod * zoom, columns, pitch, offset, detector)
     else:
         up = rng.choice([0.0, 0.0, 0.5, rng.uniform(-0.3, 0.3) * rows]) * row_pitch
-        g = ConeBeam(angles, sod, sod * zoom, columns, rows, (row_pitch, pitch), (float(up), offset), detector)
+        g = ConeBeam(
+            angles,
+            sod,
+            sod * zoom,
+            columns,
+            rows,
+            (row_pitch, pitch),
+            (float(up), offset),
+            detector,
+        )
 
     # What all views see of the field, up to the middle of the last cell but one.
-    shorter = np.abs(g.column_positions[[1, -2]]).max() if half else np.abs(g.column_positions[[1, -2]]).min()
+    shorter = (
+        np.abs(g.column_positions[[1, -2]]).max()
+        if half
+        else np.abs(g.column_positions[[1, -2]]).min()
+    )
     if kind == "parallel":
         fov = shorter
     else:
-        fov = sod * math.sin(shorter / g.sdd if detector == "curved" else math.atan(shorter / g.sdd))
+        fov = sod * math.sin(
+            shorter / g.sdd if detector == "curved" else math.atan(shorter / g.sdd)
+        )
     if kind == "cone":
         least_height = min(-g.row_positions[0], g.row_positions[-1]) + row_pitch / 2
         height = max(least_height, 0.3 * row_pitch) / zoom * (1 - fov / sod)
 
     # What is in it.
-    water = {"body": rng.uniform(0.017, 0.03), "animal": rng.uniform(0.018, 0.06), "micro": rng.uniform(0.02, 0.3)}[
-        scale
-    ]
+    water = {
+        "body": rng.uniform(0.017, 0.03),
+        "animal": rng.uniform(0.018, 0.06),
+        "micro": rng.uniform(0.02, 0.3),
+    }[scale]
     name, solids = _object(rng, fov * (rng.uniform(1.2, 1.6) if cut else 1.0), height, water)
     if cut:
         rightly += [
@@ -482,7 +603,9 @@ def draw(seed: int, *, kind: str | None = None, readings: int = 600_000) -> Draw
     grid = VolumeGrid((24, 24), side_mm / 24)
     if kind == "cone":
         slices = int(np.clip(rows // 2, 1, 5))
-        grid = VolumeGrid((slices, 24, 24), (min(2 * height / max(slices, 2), side_mm / 24), *(side_mm / 24,) * 2))
+        grid = VolumeGrid(
+            (slices, 24, 24), (min(2 * height / max(slices, 2), side_mm / 24), *(side_mm / 24,) * 2)
+        )
     shape = "" if kind == "parallel" else f", {detector}"
     text = (
         f"{kind} {scale} {name}; {views} views ({turn}), {rows}×{columns} cells of {pitch:.2g} mm, "
@@ -490,4 +613,18 @@ def draw(seed: int, *, kind: str | None = None, readings: int = 600_000) -> Draw
         f"{', arc' if 'arc' in options else ''}{', spot' if 'spot' in options else ''}"
         f"{f', {frames} air frames' if frames else ''}{', electronic noise' if noise else ''}"
     )
-    return Drawn(seed, kind, text, g, solids, photons, water, grid, profile, frames, noise, options, tuple(rightly))
+    return Drawn(
+        seed,
+        kind,
+        text,
+        g,
+        solids,
+        photons,
+        water,
+        grid,
+        profile,
+        frames,
+        noise,
+        options,
+        tuple(rightly),
+    )

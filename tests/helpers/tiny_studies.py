@@ -10,33 +10,67 @@ from recon.study import registry
 from recon.study.report import Report
 
 TINY: dict[str, dict[str, Any]] = {
-    "compare": {"n": 8, "views": 48, "methods": ("fbp:soft", "gaussian@fbp:soft"), "exposures_s": (2.0,)},
+    "compare": {
+        "n": 8,
+        "views": 48,
+        "methods": ("fbp:soft", "gaussian@fbp:soft"),
+        "exposures_s": (2.0,),
+    },
     "phantom": {"voxel_mm": 0.05, "sections": 2, "energies_kev": (55.0, 64.0)},
     "detector": {"photons": 4000, "dead_times_ns": (50.0,), "charge_sharing": (0.1,)},
     "bowtie": {
-        "views": 96, "realizations": 2, "map_mm": 12.0, "histories": 20_000, "plaque_views": 40,
-        "plaque_doses": (2.0,), "plaque_realizations": 8,
+        "views": 96,
+        "realizations": 2,
+        "map_mm": 12.0,
+        "histories": 20_000,
+        "plaque_views": 40,
+        "plaque_doses": (2.0,),
+        "plaque_realizations": 8,
     },
     "hardcases": {
-        "views": 120, "methods": ("fbp",),
+        "views": 120,
+        "methods": ("fbp",),
         "cases": (
-            "sound", "dead-column", "centre-2", "three-views", "metal", "body-sod", "body-reversed", "body-not-square",
+            "sound",
+            "dead-column",
+            "centre-2",
+            "three-views",
+            "metal",
+            "body-sod",
+            "body-reversed",
+            "body-not-square",
         ),
     },
     "motion": {
-        "thinning": 24, "fractions": (0.2, 1.0), "eid_fractions": (0.2,), "errors": (0.2,), "voxel_mm": 0.4,
-        "realizations": 1, "exposure_s": 20.0, "methods": ("fbp", "pwls"),
+        "thinning": 24,
+        "fractions": (0.2, 1.0),
+        "eid_fractions": (0.2,),
+        "errors": (0.2,),
+        "voxel_mm": 0.4,
+        "realizations": 1,
+        "exposure_s": 20.0,
+        "methods": ("fbp", "pwls"),
     },
     "noise": {
-        "realizations": 24, "views": 48, "kernels": ("soft", "bone"), "voxels_mm": (0.25, 0.40),
-        "doses": {"1x": 0.35, "5.7x": 2.0}, "reconstructed": 2, "experiments": 500,
+        "realizations": 24,
+        "views": 48,
+        "kernels": ("soft", "bone"),
+        "voxels_mm": (0.25, 0.40),
+        "doses": {"1x": 0.35, "5.7x": 2.0},
+        "reconstructed": 2,
+        "experiments": 500,
     },
     "resolution": {"thinning": 32, "sigmas_px": (0.0, 3.75, 10.0)},
     "spectral": {
-        "views": 60, "voxel_mm": 0.4, "realizations": 2, "mbir_realizations": 1, "noise_levels": (0.0, 1.0),
-        "calibration_views": 60, "transport_photons": 50_000,
+        "views": 60,
+        "voxel_mm": 0.4,
+        "realizations": 2,
+        "mbir_realizations": 1,
+        "noise_levels": (0.0, 1.0),
+        "calibration_views": 60,
+        "transport_photons": 50_000,
     },
-}  # fmt: skip
+}
 """Study → settings."""
 
 
@@ -46,8 +80,8 @@ scene:
   kind: bodies
   bodies:
     - {name: patient, shape: cylinder, semi_axes: 100, material: water}
-    - {name: insert, shape: ellipsoid, semi_axes: 1.5, position: {x: 30, y: 10, z: 0}, material: soft_tissue,
-       parent: patient}
+    - {name: insert, shape: ellipsoid, semi_axes: 1.5, position: {x: 30, y: 10, z: 0},
+       material: soft_tissue, parent: patient}
 signal: insert
 scanner: {preset: pcct, views: 90, rows: 24, energy_bin_kev: 4}
 tolerance_hu: 1000
@@ -59,7 +93,8 @@ exposures_s: 20
 
 @dataclass
 class TinyStudy:
-    """A study that ran: what it measured, its report, the folder of both, and the steps that it told."""
+    """A study that ran: what it measured, its report, the folder of both, and the steps that it
+    told."""
 
     name: str
     measured: Any
@@ -72,23 +107,30 @@ def run_tiny(name: str, folder: Path) -> TinyStudy:
     """Measure a study at its smallest scale."""
     steps: list[tuple[str, float]] = []
     settings = registry.part(name).Settings(**TINY[name])
-    measured = registry.measured(name, settings, lambda step, fraction: steps.append((step, fraction)), folder)
+    measured = registry.measured(
+        name, settings, lambda step, fraction: steps.append((step, fraction)), folder
+    )
     return TinyStudy(name, measured, registry.report_of(name, measured), folder, steps)
 
 
-def assert_report_is_whole(tiny: TinyStudy, folder: Path, figures: set[str], sections: tuple[str, ...]) -> dict:
+def assert_report_is_whole(
+    tiny: TinyStudy, folder: Path, figures: set[str], sections: tuple[str, ...]
+) -> dict:
     """The contract of every report; returns its JSON values as they were written.
 
     Each study's own test file calls it once.
     """
     files = tiny.report.save(folder / "new")
     assert {f.name for f in files} == {"report.json", "report.md", "report.html", *figures}
-    assert {f.name for f in (folder / "new").iterdir()} == {f.name for f in files}  # nothing half written is left
+    # nothing half written is left
+    assert {f.name for f in (folder / "new").iterdir()} == {f.name for f in files}
     assert all((folder / "new" / name).read_bytes().startswith(b"\x89PNG") for name in figures)
     data = json.loads((folder / "new" / "report.json").read_text(encoding="utf-8"))
     assert {"settings", "seconds", "environment"} <= set(data)
     assert data["settings"].items() >= json.loads(json.dumps(TINY[tiny.name])).items()
-    assert all({"name", "ours", "paper", "low", "high", "ok"} <= set(c) for c in data.get("checks", ()))
+    assert all(
+        {"name", "ours", "paper", "low", "high", "ok"} <= set(c) for c in data.get("checks", ())
+    )
     text = (folder / "new" / "report.md").read_text(encoding="utf-8")
     for section in sections:
         assert section in text

@@ -1,4 +1,5 @@
-"""A training that takes a blink: six numbers in, one out, with everything a run of :mod:`train.loop` needs around it.
+"""A training that takes a blink: six numbers in, one out, with everything a run of
+:mod:`train.loop` needs around it.
 
 Run as a script, it is the training that the tests kill, or start as one of several processes.
 """
@@ -48,11 +49,14 @@ class StubData:
 
     def batch(self, step, batch, indices):
         seeds = [self.seed + 1000 * step + i for i in indices]
-        return torch.stack([torch.randn(7, generator=torch.Generator().manual_seed(seed)) for seed in seeds])
+        return torch.stack(
+            [torch.randn(7, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
+        )
 
 
 class StubObjective:
-    """Squared error of a fixed function; ``at`` maps a number of the step to something to do in it."""
+    """Squared error of a fixed function; ``at`` maps a number of the step to something to do in
+    it."""
 
     def __init__(self, at=None, pause=0.0):
         self.at = at or {}
@@ -74,16 +78,22 @@ class StubObjective:
         batch = held_out.batch(10**6, 16, range(16))
         error = (model(batch[:, :6]).squeeze(1) - batch[:, :6].square().sum(1)).square().mean()
         picture = np.linspace(-200, 500, 12, dtype=np.float32).reshape(3, 4) + float(error)
-        return StubValidation(-float(error), {"rms": float(error.sqrt()), "bias": float("nan")}, {"a b": picture})
+        return StubValidation(
+            -float(error), {"rms": float(error.sqrt()), "bias": float("nan")}, {"a b": picture}
+        )
 
 
 def stub_model(seed=0):
     torch.manual_seed(seed)
-    return nn.Sequential(nn.Linear(6, 8), nn.Tanh(), nn.BatchNorm1d(8, momentum=0.1).eval(), nn.Linear(8, 1))
+    return nn.Sequential(
+        nn.Linear(6, 8), nn.Tanh(), nn.BatchNorm1d(8, momentum=0.1).eval(), nn.Linear(8, 1)
+    )
 
 
 def stub_config(**changes):
-    values = dict(steps=STEPS, batch=4, warmup=3, ema=0.9, validate_every=5, clip=20.0, learning_rate=0.02)
+    values = dict(
+        steps=STEPS, batch=4, warmup=3, ema=0.9, validate_every=5, clip=20.0, learning_rate=0.02
+    )
     return TrainConfig(**{**values, **changes})
 
 
@@ -154,9 +164,15 @@ def assert_same_tensors(a, b):
 
 def script(*arguments, more=None, **options):
     """A process of this Python, which finds the packages and has as many threads as this one."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": str(torch.get_num_threads())}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(ROOT),
+        "OMP_NUM_THREADS": str(torch.get_num_threads()),
+    }
     environment.update(more or {})
-    return subprocess.Popen([sys.executable, *arguments], env=environment, cwd=ROOT, text=True, **options)
+    return subprocess.Popen(
+        [sys.executable, *arguments], env=environment, cwd=ROOT, text=True, **options
+    )
 
 
 def _slow(out):
@@ -168,7 +184,9 @@ def _gradients(out):
     out = Path(out)
     if "STORE" in os.environ:
         rank = int(os.environ["RANK"])
-        distributed.init_process_group("gloo", init_method=os.environ["STORE"], rank=rank, world_size=2)
+        distributed.init_process_group(
+            "gloo", init_method=os.environ["STORE"], rank=rank, world_size=2
+        )
     else:
         distributed.init_process_group("gloo")
     rank = distributed.get_rank()
@@ -177,13 +195,17 @@ def _gradients(out):
     found = {name: p.grad for name, p in model.named_parameters()}
     write_tensors(out / f"rank{rank}.safetensors", "gradient", found, {"values": values})
     run(out / "whole", config)
-    state, _ = run(out / "two", config, StubObjective({6: send(signal.SIGTERM)} if rank == 1 else {}))
+    state, _ = run(
+        out / "two", config, StubObjective({6: send(signal.SIGTERM)} if rank == 1 else {})
+    )
     assert state.step == 8
     distributed.barrier()
     assert run(out / "two", config, resume=True)[0].step == STEPS
     group = weakref.ref(distributed.group.WORLD)
     distributed.destroy_process_group()
-    assert group() is None, "held, the group keeps its threads, which abort the process at its exit now and then"
+    assert group() is None, (
+        "held, the group keeps its threads, which abort the process at its exit now and then"
+    )
 
 
 def _command(out):

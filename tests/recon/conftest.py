@@ -24,10 +24,19 @@ def problem(clean):
 
 @pytest.fixture(scope="session")
 def spectral():
-    """A noise-free spectral scan of the ball, its model, line integrals and those of the surround."""
+    """A noise-free spectral scan of the ball, its model, line integrals and those of the
+    surround."""
     s = scanner("spectral", rows=10)
-    clean, model = acquire(SCENE, s, region=SPECTRAL_GRID, duty=0.06, sub_rays=16), SpectralModel.of(s, 1.0)
-    return clean, model, decompose_scan(clean, model).line_integrals, decompose_surround(clean, model)
+    clean, model = (
+        acquire(SCENE, s, region=SPECTRAL_GRID, duty=0.06, sub_rays=16),
+        SpectralModel.of(s, 1.0),
+    )
+    return (
+        clean,
+        model,
+        decompose_scan(clean, model).line_integrals,
+        decompose_surround(clean, model),
+    )
 
 
 @pytest.fixture(scope="session")
@@ -50,7 +59,8 @@ def network():
 
 @pytest.fixture
 def cli(capsys):
-    """``cli("info scan.h5", status=0)``: what a command says; on the standard error if it ends with another status."""
+    """``cli("info scan.h5", status=0)``: what a command says; on the standard error if it ends
+    with another status."""
 
     def run(words, status=0):
         capsys.readouterr()

@@ -67,19 +67,37 @@ def test_the_example_configuration_is_complete(tmp_path, cli):
     ("text", "expected_text"),
     [
         ("scene: [", "is no YAML"),
-        ("scene: {kind: water, diameter: 100}\nexposure: 1", "unknown exposure; it takes scene, scanner, exposure_s"),
+        (
+            "scene: {kind: water, diameter: 100}\nexposure: 1",
+            "unknown exposure; it takes scene, scanner, exposure_s",
+        ),
         ("- scene", "must be a mapping with scene"),
         ("scene: water", "scene must be a mapping with kind, got 'water'"),
         ("scene: {kind: fog}", "scene.kind"),
-        ("scene: {kind: bodies, bodies: [{name: a, shape: box}]}", r"scene.bodies\[0\] needs material"),
-        ("scene: {kind: bodies, bodies: [{name: a, material: water, shape: box}]}", r"scene.bodies\[0\] needs"),
+        (
+            "scene: {kind: bodies, bodies: [{name: a, shape: box}]}",
+            r"scene.bodies\[0\] needs material",
+        ),
+        (
+            "scene: {kind: bodies, bodies: [{name: a, material: water, shape: box}]}",
+            r"scene.bodies\[0\] needs",
+        ),
         ("scene: {kind: bodies, bodies: [{shape: cube}]}", r"scene.bodies\[0\].shape"),
         ("scene: {kind: volume}", "needs file"),
-        ("scene: {kind: volume, file: v.h5, energy_kev: high}", "scene.energy_kev must be a number in keV, got 'high'"),
-        ("scene: {kind: volume, file: v.h5}", "v.h5 is in mm\\^-1: a scene is made of a volume in HU"),
+        (
+            "scene: {kind: volume, file: v.h5, energy_kev: high}",
+            "scene.energy_kev must be a number in keV, got 'high'",
+        ),
+        (
+            "scene: {kind: volume, file: v.h5}",
+            "v.h5 is in mm\\^-1: a scene is made of a volume in HU",
+        ),
         ("scene: {kind: water}\nregion: {shape: [1, 2, 2]}", "region needs spacing"),
         ("scene: {kind: water}\nscanner: {preset: mri}", "scanner.preset"),
-        ("scene: {kind: water}\ntolerance_hu: small", "tolerance_hu must be a number in HU, got 'small'"),
+        (
+            "scene: {kind: water}\ntolerance_hu: small",
+            "tolerance_hu must be a number in HU, got 'small'",
+        ),
         ("scene: {kind: water}\ntolerance_hu: -1", "tolerance_hu must be"),
     ],
 )
@@ -93,7 +111,9 @@ def test_configurations_that_are_none_are_refused(tmp_path, text, expected_text)
 def test_the_seed_is_the_options_if_there_is_one_and_0_is_one(here, cli):
     (here / "scene.yaml").write_text(CONFIG, encoding="utf-8")
     for given, found in (("", 5), ("--seed 0", 0), ("--seed 7", 7)):
-        assert f"seed: {found}\n" in cli(f"simulate --config scene.yaml --dry-run --out a.h5 {given}")
+        assert f"seed: {found}\n" in cli(
+            f"simulate --config scene.yaml --dry-run --out a.h5 {given}"
+        )
 
 
 def test_scenes_by_their_kind(tmp_path):
@@ -117,13 +137,16 @@ def test_scenes_by_their_kind(tmp_path):
 def test_numbers_by_the_names_of_their_axes(tmp_path):
     """x, y, z of a body and z, y, x of a region in any order; lists as they were."""
     (tmp_path / "named.yaml").write_text(
-        "scene: {kind: bodies, bodies: [{name: a, shape: cylinder, semi_axes: {y: 2, x: 1}, material: water, "
-        "position: {z: 3, x: 1, y: 2}}]}\nregion: {shape: {x: 4, y: 5, z: 6}, spacing: {z: 1, y: 2, x: 2}, "
+        "scene: {kind: bodies, bodies: [{name: a, shape: cylinder, semi_axes: {y: 2, x: 1}, "
+        "material: water, "
+        "position: {z: 3, x: 1, y: 2}}]}\nregion: {shape: {x: 4, y: 5, z: 6}, spacing: {z: 1, y: "
+        "2, x: 2}, "
         "center: {x: 1, y: 2, z: 3}}",
         encoding="utf-8",
     )
     (tmp_path / "listed.yaml").write_text(
-        "scene: {kind: bodies, bodies: [{name: a, shape: cylinder, semi_axes: [1, 2], material: water, "
+        "scene: {kind: bodies, bodies: [{name: a, shape: cylinder, semi_axes: [1, 2], material: "
+        "water, "
         "position: [1, 2, 3]}]}\nregion: {shape: [6, 5, 4], spacing: [1, 2, 2], center: [3, 2, 1]}",
         encoding="utf-8",
     )
@@ -144,7 +167,8 @@ def test_numbers_by_the_names_of_their_axes(tmp_path):
 
 
 def test_what_is_above_muscle_in_a_volume_is_said_and_chosen(here, cli):
-    """Bone unless iodine, water or labels are asked for; the command line says which share was scanned as what."""
+    """Bone unless iodine, water or labels are asked for; the command line says which share was
+    scanned as what."""
     hu = torch.full((2, 10, 10), -1000.0)
     hu[:, 4:8, 4:8] = 40.0
     hu[:, 4, 4:8] = 300.0
@@ -157,7 +181,10 @@ def test_what_is_above_muscle_in_a_volume_is_said_and_chosen(here, cli):
     for dense, expected_text in (
         ("", "4.0% of the voxels as bone"),
         (", dense: iodine", "4.0% of the voxels as iodine"),
-        (", dense: labels.h5", "2.0% of the voxels as bone, 2.0% of the voxels as iodine, 0.0% of the voxels as water"),
+        (
+            ", dense: labels.h5",
+            "2.0% of the voxels as bone, 2.0% of the voxels as iodine, 0.0% of the voxels as water",
+        ),
     ):
         path.write_text(f"scene: {{kind: volume, file: v.h5{dense}}}{scanner}", encoding="utf-8")
         assert expected_text in cli("simulate --config scene.yaml --dry-run --out s.h5")
@@ -173,10 +200,13 @@ def test_what_is_above_muscle_in_a_volume_is_said_and_chosen(here, cli):
 
 
 def test_a_foreign_scan_without_pixel_size(here, cli):
-    """README's own command on the best known file of the format; every refusal names options of the command line."""
+    """README's own command on the best known file of the format; every refusal names options of
+    the command line."""
     geometry = ParallelBeam(np.arange(31) * np.pi / 30, 48, 1.0)
     lines = line_integrals(geometry, [Ellipsoid((2.0, -3.0), 12.0, value=0.02)])
-    data_exchange("tooth.h5", 4e4 * np.exp(-lines[:, None]), np.full((5, 1, 48), 4e4), geometry.angles)
+    data_exchange(
+        "tooth.h5", 4e4 * np.exp(-lines[:, None]), np.full((5, 1, 48), 4e4), geometry.angles
+    )
     assert "unit: pixel^-1" in cli("info tooth.h5")
     command = "reconstruct tooth.h5 --find-axis --out tooth.nii.gz"
     output = cli(command)
@@ -195,7 +225,8 @@ def test_a_foreign_scan_without_pixel_size(here, cli):
 
 
 def test_names_and_grey_scale_of_their_own(here, cli):
-    """Without --out in the working directory; a volume in mm⁻¹ is not drawn black; a scan is no volume."""
+    """Without --out in the working directory; a volume in mm⁻¹ is not drawn black; a scan is no
+    volume."""
     geometry = ParallelBeam(np.arange(8) * np.pi / 8, 12, 1.0)
     Scan.from_line_integrals(np.full(geometry.shape, 0.3), geometry, photons=1e4).save("lines.h5")
     plan = json.loads(cli("reconstruct lines.h5 --dry-run --json"))
@@ -212,10 +243,13 @@ def test_names_and_grey_scale_of_their_own(here, cli):
 
 
 def test_a_lower_dose_of_a_scan_file(here, cli):
-    """Counts are thinned, the same by the same seed; nothing is made of line integrals of unknown photons."""
+    """Counts are thinned, the same by the same seed; nothing is made of line integrals of
+    unknown photons."""
     geometry = ParallelBeam(np.arange(60) * np.pi / 60, 40, 0.5)
     lines = line_integrals(geometry, [Ellipsoid((0.0, 0.0), 8.0, value=0.02)])
-    scan = Scan.from_counts(np.random.default_rng(0).poisson(1e4 * np.exp(-lines)), geometry, air=1e4)
+    scan = Scan.from_counts(
+        np.random.default_rng(0).poisson(1e4 * np.exp(-lines)), geometry, air=1e4
+    )
     scan.save("full.h5")
     assert "exact" in cli("lower-dose full.h5 --fraction 0.1 --seed 3 --out low.h5")
     low = Scan.load("low.h5")
@@ -263,14 +297,17 @@ def test_a_report_says_what_it_was_made_of_and_how(here, capsys, cli):
     assert report["torchpcct"] == __version__
     assert report["input_sha256"] == hashlib.sha256((here / "scan.h5").read_bytes()).hexdigest()
     assert all(output.err.count(text) <= 1 for text in report["warnings"])
-    assert json.loads((here / "v.h5.json").read_text(encoding="utf-8"))["command"] == report["command"]
+    assert (
+        json.loads((here / "v.h5.json").read_text(encoding="utf-8"))["command"] == report["command"]
+    )
     command += " --force --weights scan.h5"
     assert "--weights is an option of --method mbir" in cli(command, 2)
     assert "holds no weights of this unrolled reconstruction" in cli(f"{command} --method mbir", 2)
 
 
 def test_the_example_of_a_stack_is_complete(cli):
-    text = cli("show-config --stack").split("\n", 1)[1].replace("\n# ", "\n")  # what is optional, too
+    # what is optional, too
+    text = cli("show-config --stack").split("\n", 1)[1].replace("\n# ", "\n")
     given = yaml.safe_load(text)
     assert set(given) - {"readings", "kind", "geometry"} <= _COUNTS | _LINES
     assert geometry_of(given["geometry"]).shape == (720, 64, 888)
@@ -284,9 +321,14 @@ def test_a_warning_is_said_once_and_in_the_words_of_the_command(capsys):
         warnings.warn("too few: give pitch=", UserWarning, stacklevel=1)
         warn("too few: give pitch=")
     assert capsys.readouterr().err == "warning: too few: give --pitch MM\n"
-    assert as_options("pitch=0.5 or pitch='x'; pitch must be 1", actions) == "--pitch 0.5 or --pitch x; pitch must be 1"
+    assert (
+        as_options("pitch=0.5 or pitch='x'; pitch must be 1", actions)
+        == "--pitch 0.5 or --pitch x; pitch must be 1"
+    )
     assert as_options("pitch must be 1", actions) == "--pitch must be 1"
-    assert as_options("a: pitch[1] needs 1 (pitch=)", actions) == "a: --pitch[1] needs 1 (--pitch MM)"
+    assert (
+        as_options("a: pitch[1] needs 1 (pitch=)", actions) == "a: --pitch[1] needs 1 (--pitch MM)"
+    )
 
 
 @pytest.mark.parametrize(
@@ -307,7 +349,8 @@ def test_a_warning_is_said_once_and_in_the_words_of_the_command(capsys):
 def test_a_value_in_a_message_stays_as_it_is(value):
     actions = [argparse.ArgumentParser().add_argument("--pitch", metavar="MM")]
     assert (
-        as_options(f"{value} does not fit the scan's pitch=", actions) == f"{value} does not fit the scan's --pitch MM"
+        as_options(f"{value} does not fit the scan's pitch=", actions)
+        == f"{value} does not fit the scan's --pitch MM"
     )
 
 
@@ -317,8 +360,14 @@ def test_a_scan_of_a_region_is_reconstructed_there(here, cli, clean):
     cli("reconstruct mine.h5 --out mine.nii.gz")
     assert Volume.load("mine.nii.gz").grid.shape == GRID.shape
     np.testing.assert_allclose(Volume.load("mine.nii.gz").grid.center, GRID.center, atol=1e-4)
-    elsewhere = yaml.safe_load(cli("reconstruct mine.h5 --voxel 0.8 --extent 1.6 3.2 4 --dry-run").rpartition("\n")[0])
-    assert elsewhere["grid"] == {"shape": [2, 4, 5], "spacing": [0.8] * 3, "center": list(GRID.center)}
+    elsewhere = yaml.safe_load(
+        cli("reconstruct mine.h5 --voxel 0.8 --extent 1.6 3.2 4 --dry-run").rpartition("\n")[0]
+    )
+    assert elsewhere["grid"] == {
+        "shape": [2, 4, 5],
+        "spacing": [0.8] * 3,
+        "center": list(GRID.center),
+    }
     said = cli("reconstruct mine.h5 --memory 2GB --out mine.nii", 2)
     assert "mine.h5 can only be read as a whole: leave out --memory SIZE" in said
     assert "damaged" not in said
@@ -326,7 +375,9 @@ def test_a_scan_of_a_region_is_reconstructed_there(here, cli, clean):
 
 
 def test_what_a_drawn_vessel_has_changed_is_written_and_shown(here, cli, clean, monkeypatch):
-    monkeypatch.setattr(OutlineMbir, "drawn", lambda self, problem, b, exposure_s: Drawn(torch.zeros(b.shape), {}))
+    monkeypatch.setattr(
+        OutlineMbir, "drawn", lambda self, problem, b, exposure_s: Drawn(torch.zeros(b.shape), {})
+    )
     clean.with_noise(1.0, 0).save("mine.h5")
     cli("reconstruct mine.h5 --method mbir --vessel --out a.nii.gz")
     report = json.loads((here / "a.nii.gz.json").read_text(encoding="utf-8"))

@@ -1,4 +1,5 @@
-"""The command line under bad input and bad circumstances: at once, in words, and nothing left behind."""
+"""The command line under bad input and bad circumstances: at once, in words, and nothing left
+behind."""
 
 import io
 import json
@@ -119,7 +120,14 @@ def test_help_and_refusals_load_neither_torch_nor_numba(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["f.h5"]
 
 
-_FIRST = {"reconstruct": ["s"], "lower-dose": ["s"], "view": ["v"], "info": ["f"], "plaque": ["s"], "study": ["noise"]}
+_FIRST = {
+    "reconstruct": ["s"],
+    "lower-dose": ["s"],
+    "view": ["v"],
+    "info": ["f"],
+    "plaque": ["s"],
+    "study": ["noise"],
+}
 
 
 def _parsers():
@@ -137,7 +145,8 @@ def _options():
 
 
 def _refused(parser, action, words, value):
-    """Whether a value ends with status 2, or with a sentence of :func:`check_limits` that names the option."""
+    """Whether a value ends with status 2, or with a sentence of :func:`check_limits` that names
+    the option."""
     flag, count = action.option_strings[0], action.nargs if isinstance(action.nargs, int) else 1
     given = [f"{flag}={value}"] if count == 1 else [flag, *[value] * count]
     try:
@@ -155,15 +164,26 @@ def test_every_number_of_the_command_line_has_limits(capsys):
     numbers = [option for option in _options() if option[2].type in (int, float, _length)]
     assert len(numbers) > 60
     values = ("nan", "inf", "-inf", "1e400", "1e30", "9" * 40, "x")
-    assert not [(n, a.dest, v) for n, p, a, words in numbers for v in values if not _refused(p, a, words, v)]
+    assert not [
+        (n, a.dest, v) for n, p, a, words in numbers for v in values if not _refused(p, a, words, v)
+    ]
     # Below 0 are places, grey values and HU alone.
-    below = {action.dest for _, parser, action, words in numbers if not _refused(parser, action, words, "-3")}
+    below = {
+        action.dest
+        for _, parser, action, words in numbers
+        if not _refused(parser, action, words, "-3")
+    }
     assert below == {"center", "level", "point", "wall", "fibrous"}
     assert all(line.startswith("torchpcct ") for line in capsys.readouterr().err.splitlines())
 
 
 def test_no_option_takes_an_empty_text(capsys):
-    assert not [(n, a.dest) for n, p, a, words in _options() for v in ("", "  ") if not _refused(p, a, words, v)]
+    assert not [
+        (n, a.dest)
+        for n, p, a, words in _options()
+        for v in ("", "  ")
+        if not _refused(p, a, words, v)
+    ]
     assert all(line.startswith("torchpcct ") for line in capsys.readouterr().err.splitlines())
 
 
@@ -179,7 +199,10 @@ def test_the_examples_of_studies_are_settings_that_they_take():
             else:
                 values = {key: value for key, value in vars(given).items() if value is not None}
                 assert registry.part(name).Settings.of(values, given.quick)
-    assert f"(default {registry.part('hardcases').Settings().views})" in _parsers()["hardcases"].format_help()
+    assert (
+        f"(default {registry.part('hardcases').Settings().views})"
+        in _parsers()["hardcases"].format_help()
+    )
 
 
 def test_a_scan_alone_is_given_to_the_workers_that_were_asked_for(here, lines, cli, monkeypatch):
@@ -193,12 +216,17 @@ def test_a_scan_alone_is_given_to_the_workers_that_were_asked_for(here, lines, c
         assert message in cli(f"reconstruct one.h5 {words}", 2)
     assert [p.name for p in here.iterdir()] == ["one.h5"]
     asked = []
-    monkeypatch.setattr("recon.evaluate.execute.Processes", lambda *n: asked.append(n) or ThreadPoolExecutor(1))
+    monkeypatch.setattr(
+        "recon.evaluate.execute.Processes", lambda *n: asked.append(n) or ThreadPoolExecutor(1)
+    )
     assert "one_fbp.nii.gz: 1 × " in cli("reconstruct one.h5 --workers 3 --threads 2")
     assert asked == [(3, 2)]
     assert {p.name for p in here.iterdir() if not p.name.startswith("jobs-")} == {
-        "one.h5", "one_fbp.nii.gz", "one_fbp.nii.gz.json", "one_fbp.nii.gz.yaml"
-    }  # fmt: skip
+        "one.h5",
+        "one_fbp.nii.gz",
+        "one_fbp.nii.gz.json",
+        "one_fbp.nii.gz.yaml",
+    }
     assert "unknown kernel" in cli("reconstruct one.h5 --workers 1 --kernel sotf", 2)
 
 
@@ -207,15 +235,20 @@ def test_a_scheduler_that_is_gone_is_said(here, lines, cli):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    said = cli(f"reconstruct {lines / 'one.h5'} --scheduler tcp://127.0.0.1:{port} --out one.nii", 2)
-    assert re.fullmatch(rf"torchpcct reconstruct: no Dask scheduler answers at \S+:{port} within \d+ s\n", said)
+    said = cli(
+        f"reconstruct {lines / 'one.h5'} --scheduler tcp://127.0.0.1:{port} --out one.nii", 2
+    )
+    assert re.fullmatch(
+        rf"torchpcct reconstruct: no Dask scheduler answers at \S+:{port} within \d+ s\n", said
+    )
     assert not (here / "one.nii").exists()
 
 
 def test_what_a_killed_process_left_is_swept_by_the_next_write(tmp_path):
     process = int(run_python("import os; print(os.getpid())").stdout)
     old, mine, other = (_part(tmp_path / "v.h5", n) for n in (process, os.getppid(), 1))
-    elsewhere = tmp_path / f".{process}-ffffff-00000000.part.v.h5"  # of another machine: who knows whether it lives?
+    # of another machine: who knows whether it lives?
+    elsewhere = tmp_path / f".{process}-ffffff-00000000.part.v.h5"
     for part in (old, mine, other, elsewhere):
         part.write_bytes(b"half")
         os.utime(part, (time.time() - 3600,) * 2)
@@ -264,7 +297,9 @@ def test_damaged_pieces_are_computed_again(tmp_path, monkeypatch):
         elif trial % 3 == 1:
             del content[at:]
         else:
-            content[at : at + 40] = rng.integers(0, 256, len(content[at : at + 40]), dtype=np.uint8).tobytes()
+            content[at : at + 40] = rng.integers(
+                0, 256, len(content[at : at + 40]), dtype=np.uint8
+            ).tobytes()
         (tmp_path / "p.npz").write_bytes(bytes(content))
         found = store.piece("p", "key", lambda: arrays)
         assert sorted(found) == ["a", "b"]
@@ -274,7 +309,10 @@ def test_damaged_pieces_are_computed_again(tmp_path, monkeypatch):
         seal = {k: file[k] for k in ("key", "sum")}
         parts = {k: file[k] for k in file.files if k not in seal}
     assert "a0" in parts
-    for other in ({k: v for k, v in parts.items() if k != "a1"}, {**parts, "a0": parts["a0"] + 1e-12}):
+    for other in (
+        {k: v for k, v in parts.items() if k != "a1"},
+        {**parts, "a0": parts["a0"] + 1e-12},
+    ):
         np.savez(tmp_path / "p.npz", **seal, **other)
         assert sorted(store.piece("p", "key", lambda: arrays)) == ["a", "b"]
         assert np.array_equal(store.piece("p", "key", pytest.fail)["a"], arrays["a"])
@@ -334,7 +372,9 @@ def test_no_command_writes_onto_what_it_reads(here, lines, cli):
 
 def test_files_of_others_are_replaced_by_force_only(here, lines, cli):
     scan = lines / "two.h5"
-    nibabel.save(nibabel.Nifti1Image(np.zeros((2, 2, 2), np.float32), np.eye(4)), here / "patient.nii.gz")
+    nibabel.save(
+        nibabel.Nifti1Image(np.zeros((2, 2, 2), np.float32), np.eye(4)), here / "patient.nii.gz"
+    )
     with h5py.File(here / "tooth.h5", "w") as file:
         file["exchange/data"] = np.zeros(3)
     (here / "w.mha.json").write_text('{"mine": 1}', encoding="utf-8")
@@ -345,8 +385,14 @@ def test_files_of_others_are_replaced_by_force_only(here, lines, cli):
     (here / "d.nii").mkdir()
     before = _contents(here / "study")
     for words, expected_text in (
-        (f"reconstruct {scan} --out patient.nii.gz", "patient.nii.gz exists and was not made by torchpcct recon"),
-        (f"reconstruct {scan} --out tooth.h5", "tooth.h5 exists and was not made by torchpcct reconstruct: name"),
+        (
+            f"reconstruct {scan} --out patient.nii.gz",
+            "patient.nii.gz exists and was not made by torchpcct recon",
+        ),
+        (
+            f"reconstruct {scan} --out tooth.h5",
+            "tooth.h5 exists and was not made by torchpcct reconstruct: name",
+        ),
         (f"reconstruct {scan} --out w.mha", "w.mha.json exists"),
         (f"reconstruct {scan} --out x.nii", "x.nii.yaml exists"),
         (f"reconstruct {scan} --out d.nii", "is a folder"),
@@ -354,7 +400,10 @@ def test_files_of_others_are_replaced_by_force_only(here, lines, cli):
         (f"lower-dose {scan} --fraction 0.5 --out tooth.h5", "not made by torchpcct lower-dose"),
         (f"view {scan} --out picture.png", "picture.png exists and was not made"),
         ("study noise --quick --out study", "study holds report.md, not made by torchpcct study"),
-        ("compare --quick --out study", "not made by torchpcct compare: name another folder, or --force"),
+        (
+            "compare --quick --out study",
+            "not made by torchpcct compare: name another folder, or --force",
+        ),
         (f"plaque {scan} --out study", "study holds report.md, not made by torchpcct plaque"),
     ):
         assert expected_text in cli(words, 2)
@@ -365,7 +414,9 @@ def test_files_of_others_are_replaced_by_force_only(here, lines, cli):
         assert Volume.load(name).grid.shape[0] == 2
 
 
-def test_a_result_that_cannot_be_written_is_found_before_it_is_computed(here, lines, cli, monkeypatch):
+def test_a_result_that_cannot_be_written_is_found_before_it_is_computed(
+    here, lines, cli, monkeypatch
+):
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=100_000))
     monkeypatch.setattr("recon.api.reconstruct", lambda *_, **__: pytest.fail("computed"))
     (here / "full").mkdir()
@@ -388,7 +439,9 @@ def test_one_slice_is_a_volume_of_one_slice(here, lines, cli):
     for name in ("v.nii.gz", "v.mha", "v.h5"):
         cli(f"reconstruct {lines / 'one.h5'} --voxel 0.5 --extent 4 5 --center 1 2 --out {name}")
         found = Volume.load(name).grid
-        np.testing.assert_allclose([*found.shape, *found.spacing, *found.center], [1, 8, 10, 0.5, 0.5, 0.5, 0, 1, 2])
+        np.testing.assert_allclose(
+            [*found.shape, *found.spacing, *found.center], [1, 8, 10, 0.5, 0.5, 0.5, 0, 1, 2]
+        )
         assert json.loads((here / f"{name}.json").read_text())["shape"] == [1, 8, 10]
     cli(f"reconstruct {lines / 'two.h5'} --extent 4 4 --center 7 0 0 --out series")
     assert Volume.load("series").grid.center == (7.0, 0.0, 0.0)

@@ -1,4 +1,5 @@
-"""The first ten minutes with the command line: what it says unasked, what it guesses, what it finds broken."""
+"""The first ten minutes with the command line: what it says unasked, what it guesses, what it
+finds broken."""
 
 import re
 import shlex
@@ -54,7 +55,10 @@ def test_every_command_stands_in_the_help_once_and_has_examples_that_it_takes(cl
     ("words", "expected_text"),
     [
         ("recontruct scan.h5", "unknown command 'recontruct' (did you mean 'reconstruct'?)"),
-        ("reconstruct scan.h5 --kernal soft", "unrecognized arguments: --kernal soft (did you mean '--kernel'?)"),
+        (
+            "reconstruct scan.h5 --kernal soft",
+            "unrecognized arguments: --kernal soft (did you mean '--kernel'?)",
+        ),
         ("simulate --out a.h5 --device cdua", "(did you mean 'cuda'?)"),
         ("evaluate --task nodul --out out", "(did you mean 'nodule'?)"),
         ("evaluate --method pwsl --out out", "(did you mean 'pwls'?)"),
@@ -77,7 +81,9 @@ def test_the_demo_does_what_its_lines_do(quick, tmp_path, cli, monkeypatch):
     if quick:  # FBP in place of MBIR
         real = recon.api.reconstruct
         monkeypatch.setattr(starting, "_DEMO_VIEWS", 12)
-        monkeypatch.setattr("recon.api.reconstruct", lambda scan, grid, method, **_: real(scan, grid, "fbp"))
+        monkeypatch.setattr(
+            "recon.api.reconstruct", lambda scan, grid, method, **_: real(scan, grid, "fbp")
+        )
     first, second = tmp_path / "first", tmp_path / "second"
     second.mkdir()
     lines = re.findall(r"^\$ torchpcct (.*)$", cli(f"demo --out {first}"), re.MULTILINE)
@@ -100,13 +106,24 @@ def test_doctor_names_what_is_broken_and_what_to_do(capsys, cli, monkeypatch):
     output = cli("doctor")
     assert len(re.findall("^ok ", output, re.MULTILINE)) == len(doctor._CHECKS)
     assert re.search("weights +sha256 [0-9a-f]{64}, as their card says", output)
-    monkeypatch.setattr("torchpcct.projector.Projector.T", lambda self, y: 1.001 * torch.ones(8, 20, 20))
+    monkeypatch.setattr(
+        "torchpcct.projector.Projector.T", lambda self, y: 1.001 * torch.ones(8, 20, 20)
+    )
     monkeypatch.setattr("recon.mbir.mbir.Mbir.weights_sha256", "0" * 64)
-    monkeypatch.setattr("recon.api.reconstruct", lambda *_, **__: Volume(torch.full((40, 40), 9.0), _[1]))
-    monkeypatch.setattr(doctor, "require_writable", lambda folder: (_ for _ in ()).throw(PermissionError("no")))
-    monkeypatch.setattr("importlib.metadata.requires", lambda name: ["numpy>=99", "nonesuch>=1", "x>=1; extra == 'io'"])
+    monkeypatch.setattr(
+        "recon.api.reconstruct", lambda *_, **__: Volume(torch.full((40, 40), 9.0), _[1])
+    )
+    monkeypatch.setattr(
+        doctor, "require_writable", lambda folder: (_ for _ in ()).throw(PermissionError("no"))
+    )
+    monkeypatch.setattr(
+        "importlib.metadata.requires",
+        lambda name: ["numpy>=99", "nonesuch>=1", "x>=1; extra == 'io'"],
+    )
     assert main(["doctor"]) == 1
-    lines = dict(re.findall(r"^BROKEN +(\S+(?: \S+)?)  +(.*)$", capsys.readouterr().out, re.MULTILINE))
+    lines = dict(
+        re.findall(r"^BROKEN +(\S+(?: \S+)?)  +(.*)$", capsys.readouterr().out, re.MULTILINE)
+    )
     assert set(lines) == {"packages", "kernel cache", "weights", "adjoint", "FBP"}
     assert "is older than 99" in lines["packages"]
     assert lines["packages"].endswith("pip install --force-reinstall 'numpy>=99' 'nonesuch>=1'")
@@ -127,7 +144,9 @@ def test_doctor_loads_the_packages_of_the_extras(tmp_path, monkeypatch):
         (tmp_path / f"{name}.py").write_text(text, encoding="utf-8")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     versions = {"sound": "1.0", "raises": "1.0", "ends": "1.0", "old": "1.9"}
-    monkeypatch.setattr("importlib.metadata.version", lambda name: versions.get(name) or _no_package(name))
+    monkeypatch.setattr(
+        "importlib.metadata.version", lambda name: versions.get(name) or _no_package(name)
+    )
     monkeypatch.setattr(
         "importlib.metadata.requires",
         lambda _: [
@@ -143,11 +162,14 @@ def test_doctor_loads_the_packages_of_the_extras(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="does not load") as found:
         doctor._extras()
     assert sorted(str(found.value).split("; ")) == [
-        "ends of b does not load (it ends the process, status -6): pip install --force-reinstall 'ends'",
+        "ends of b does not load (it ends the process, status -6): pip install --force-reinstall "
+        "'ends'",
         "old 1.9 of b is older than 1.10: pip install 'old>=1.10'",
         "raises of a does not load (undefined symbol: x): pip install --force-reinstall 'raises'",
     ]
-    monkeypatch.setattr("importlib.metadata.requires", lambda _: ['sound>=1; extra == "a"', 'lacking; extra == "c"'])
+    monkeypatch.setattr(
+        "importlib.metadata.requires", lambda _: ['sound>=1; extra == "a"', 'lacking; extra == "c"']
+    )
     assert doctor._extras() == "a; c lacks lacking (pip install 'torchpcct[c]')"
 
 
@@ -159,8 +181,11 @@ def test_the_module_is_the_command(tmp_path):
     for module in ("torchpcct", "recon.cli"):
         done = subprocess.run(
             [sys.executable, "-m", module, "reconstruct", "x.h5", "--voxel", "0"],
-            capture_output=True, text=True, cwd=tmp_path, env={"PYTHONPATH": str(ROOT)},
-        )  # fmt: skip
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+            env={"PYTHONPATH": str(ROOT)},
+        )
         assert done.returncode == 2
         assert done.stderr == "torchpcct reconstruct: --voxel must be greater than 0 mm, got 0\n"
 
@@ -169,10 +194,15 @@ def test_train_is_ours_whatever_lies_in_the_folder(tmp_path):
     (tmp_path / "train").mkdir()
     for name in ("__init__", "__main__"):
         (tmp_path / "train" / f"{name}.py").write_text("print('MINE')", encoding="utf-8")
-    code = "import train, sys; from recon.cli import main; sys.exit(main(['train', '--help']))"  # theirs is loaded, too
+    # theirs is loaded, too
+    code = "import train, sys; from recon.cli import main; sys.exit(main(['train', '--help']))"
     for words in (["-m", "recon.cli", "train", "--help"], ["-c", code]):
         run = subprocess.run(
-            [sys.executable, *words], capture_output=True, text=True, cwd=tmp_path, env={"PYTHONPATH": str(ROOT)}
+            [sys.executable, *words],
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+            env={"PYTHONPATH": str(ROOT)},
         )
         assert run.returncode == 0, run.stderr
         assert "usage: torchpcct train" in run.stdout

@@ -16,7 +16,10 @@ def geometries(columns):
     yield ParallelBeam(np.arange(24) * math.pi / 24, columns, 1.0), VolumeGrid((3, 3), 1.0)
     yield FanBeam(turn, 50.0, 80.0, columns, 1.6, 0.3), VolumeGrid((3, 3), 1.0)
     yield ConeBeam(turn, 50.0, 80.0, columns, 1, 1.6), VolumeGrid((1, 3, 3), 1.0)
-    yield ConeBeam(turn, 50.0, 80.0, columns, 2, 1.6, (0.0, 0.3), "curved"), VolumeGrid((2, 1, 1), 1.0)
+    yield (
+        ConeBeam(turn, 50.0, 80.0, columns, 2, 1.6, (0.0, 0.3), "curved"),
+        VolumeGrid((2, 1, 1), 1.0),
+    )
     yield FanBeam([0.3], 50.0, 80.0, columns, 1.6), VolumeGrid((1, 1), 1.0)
 
 
@@ -27,7 +30,9 @@ def test_detectors_of_few_columns(columns, method, caplog):
     for geometry, grid in geometries(columns):
         counts = np.random.default_rng(0).poisson(9e3, geometry.shape).astype("f4")
         try:
-            volume = reconstruct(Scan.from_counts(counts, geometry, air=1e4, mu_water=0.02), grid, method)
+            volume = reconstruct(
+                Scan.from_counts(counts, geometry, air=1e4, mu_water=0.02), grid, method
+            )
         except ValueError as error:
             assert len(str(error)) > 40  # noqa: PT017 (some are refused, some not)
         else:

@@ -43,15 +43,20 @@ def fake_bm4d(monkeypatch):
 
 @pytest.mark.parametrize("name", OWN)
 def test_what_every_filter_leaves_alone(name, noise):
-    """Constants, an added constant, the unit, the mirror, the kind and dtype, and the caller's volume."""
+    """Constants, an added constant, the unit, the mirror, the kind and dtype, and the caller's
+    volume."""
     found = run(name, noise)
-    torch.testing.assert_close(run(name, torch.full(SHAPE, -93.0)), torch.full(SHAPE, -93.0), rtol=0, atol=1e-3)
+    torch.testing.assert_close(
+        run(name, torch.full(SHAPE, -93.0)), torch.full(SHAPE, -93.0), rtol=0, atol=1e-3
+    )
     torch.testing.assert_close(run(name, noise + 500.0), found + 500.0, rtol=0, atol=2e-2)
     torch.testing.assert_close(run(name, 2 * noise, 2 * NOISE), 2 * found, rtol=0, atol=2e-2)
     for axis in range(3):
         # Total variation by forward differences is symmetric but for its discretisation.
         mirrored = run(name, noise.flip(axis))
-        torch.testing.assert_close(mirrored, found.flip(axis), rtol=0, atol=0.15 * NOISE if name == "tv" else 2e-2)
+        torch.testing.assert_close(
+            mirrored, found.flip(axis), rtol=0, atol=0.15 * NOISE if name == "tv" else 2e-2
+        )
     kept = noise.double().numpy().copy()
     array = run(name, kept)
     assert isinstance(array, np.ndarray)
@@ -109,7 +114,9 @@ def test_non_local_means_are_their_formula(noise):
     """At one voxel, written out; the volume goes on with its outermost voxels."""
     wide = np.pad(noise.double().numpy(), 3, mode="edge")
     place = (1, 6, 13)
-    cubes = np.lib.stride_tricks.sliding_window_view(wide, (3, 3, 3))[tuple(slice(k, k + 5) for k in place)]
+    cubes = np.lib.stride_tricks.sliding_window_view(wide, (3, 3, 3))[
+        tuple(slice(k, k + 5) for k in place)
+    ]
     unlike = np.square(cubes - cubes[2, 2, 2]).mean((3, 4, 5))
     weights = np.exp(-np.maximum(unlike - 2 * NOISE**2, 0) / (0.6 * NOISE) ** 2)
     want = (weights * cubes[..., 1, 1, 1]).sum() / weights.sum()
@@ -128,12 +135,16 @@ def test_the_noise_is_measured_where_the_volume_is_flat(noise):
     # Each filter gets the level of what it looks at.
     torch.testing.assert_close(denoised("tv", volume, flat), FILTERS["tv"](volume, level))
     torch.testing.assert_close(denoised("perona_malik", volume, flat), perona_malik(volume, smooth))
-    torch.testing.assert_close(denoised("perona_malik", volume, flat, sigma=0.0), perona_malik(volume, level, sigma=0))
+    torch.testing.assert_close(
+        denoised("perona_malik", volume, flat, sigma=0.0), perona_malik(volume, level, sigma=0)
+    )
 
 
 def test_bm4d_is_told_the_noise_and_its_spectrum(fake_bm4d, noise):
     found = filters.bm4d(noise + 1000.0, NOISE, strength=0.5)
-    torch.testing.assert_close(found, (noise + 1000.0) / 2 + float((noise + 1000.0).mean()) / 2, rtol=0, atol=1e-2)
+    torch.testing.assert_close(
+        found, (noise + 1000.0) / 2 + float((noise + 1000.0).mean()) / 2, rtol=0, atol=1e-2
+    )
     assert fake_bm4d[0][1] == 0.5 * NOISE
     # White noise, smoothed along x: its spectrum falls along x alone, and adds up to the variance.
     covariance = np.zeros((3, 3, 5))
@@ -154,7 +165,9 @@ def test_bm4d_without_its_package_says_how_to_get_it(monkeypatch, noise):
     with pytest.raises(ImportError, match=r"torchpcct\[rivals\].*non-commercial"):
         filters.bm4d(noise, NOISE)
     # A release that calls what NumPy no longer has.
-    monkeypatch.setitem(sys.modules, "bm4d", types.SimpleNamespace(bm4d=lambda z, sigma: np.not_there))
+    monkeypatch.setitem(
+        sys.modules, "bm4d", types.SimpleNamespace(bm4d=lambda z, sigma: np.not_there)
+    )
     with pytest.raises(ImportError, match=r"does not run with NumPy.*not_there"):
         filters.bm4d(noise, NOISE)
 

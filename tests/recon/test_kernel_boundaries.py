@@ -1,4 +1,5 @@
-"""Compiled kernels check no index: what hands arrays to them refuses those that do not belong together."""
+"""Compiled kernels check no index: what hands arrays to them refuses those that do not belong
+together."""
 
 import numpy as np
 import pytest
@@ -45,14 +46,24 @@ def test_the_prior_compares_dtypes():
 
 def test_the_bilateral_filter_compares_its_arguments():
     u, t = torch.zeros(1, 4, 5, 6), torch.ones(1)
-    for arguments in ((u, u[..., :5], t), (u, u, torch.ones(2)), (u[0], u[0], t), (u, u, t, 0.0), (u, u, t, 2.5, 0)):
+    for arguments in (
+        (u, u[..., :5], t),
+        (u, u, torch.ones(2)),
+        (u[0], u[0], t),
+        (u, u, t, 0.0),
+        (u, u, t, 2.5, 0),
+    ):
         with pytest.raises(ValueError, match=r"must have the shape|greater than 0|at least 1"):
             joint_bilateral(*arguments)
 
 
 def test_the_inset_model_compares_its_bands():
     band = torch.ones(1, 3, 2, 4, 4, dtype=torch.complex64)
-    for spectra in (band, torch.ones(7, 2, 2, 4, 4, dtype=torch.complex64), torch.ones(3, 4, dtype=torch.complex64)):
+    for spectra in (
+        band,
+        torch.ones(7, 2, 2, 4, 4, dtype=torch.complex64),
+        torch.ones(3, 4, dtype=torch.complex64),
+    ):
         with pytest.raises(ValueError, match="got the shape"):
             make_definite(spectra)
     with pytest.raises(ValueError, match="got the shape"):
@@ -70,8 +81,14 @@ def test_voxels_beyond_the_grid_are_refused():
 
 def test_a_simulation_compares_its_arrays():
     g = ConeBeam(full_turn(3), 50.0, 80.0, 4, 2, 1.0)
-    bodies = BodySet(np.zeros(0, np.int64), np.zeros((0, 24)), np.zeros((0, 2)), np.zeros((0, 3, 3)),
-                     np.zeros((0, 3, 3)), (0.0, 0.0, np.inf))  # fmt: skip
+    bodies = BodySet(
+        np.zeros(0, np.int64),
+        np.zeros((0, 24)),
+        np.zeros((0, 2)),
+        np.zeros((0, 3, 3)),
+        np.zeros((0, 3, 3)),
+        (0.0, 0.0, np.inf),
+    )
     beam = Beam(np.ones((1, 4, 2)), np.ones(2), (0.0, 0.0), np.zeros((1, 5)))
     whole, step = DetectorWindow.full(g), np.zeros(3)
     assert expected_readings(g, whole, bodies, beam, step).shape == (1, 3, 2, 4)

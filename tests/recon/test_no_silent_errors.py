@@ -1,4 +1,5 @@
-"""What once gave a wrong volume without a word: each is refused, warned of, or right (reconstruction)."""
+"""What once gave a wrong volume without a word: each is refused, warned of, or right
+(reconstruction)."""
 
 import logging
 import math
@@ -31,7 +32,8 @@ def test_slices_that_the_rows_do_not_see_are_named(clean, caplog):
     report = reconstruct(clean, tall, "fbp").report
     assert any("are seen in no view" in text for text in report["warnings"])
     assert "are seen in no view" in caplog.text
-    # 12 rows of 0.5 mm at the axis; at the plaque, 42 mm from it, between (626 − 42) / 626 and (626 + 42) / 626 of it.
+    # 12 rows of 0.5 mm at the axis; at the plaque, 42 mm from it, between (626 − 42) / 626 and (626
+    # + 42) / 626 of it.
     g = clean.geometry
     edge = 6 * g.pitch[0] / g.magnification * (g.sod - math.hypot(*CENTER[1:])) / g.sod
     inside = VolumeGrid((1, 1, 1), 0.01, (0.98 * edge, *CENTER[1:]))
@@ -49,7 +51,10 @@ def test_fbp_of_a_tensor_refuses_a_grid_beyond_the_rows():
 
 @pytest.mark.parametrize("views", [1, 2, 3, 4])
 def test_a_handful_of_views_is_refused(views):
-    for g in (FanBeam(full_turn(views), 500.0, 1000.0, 64, 1.0), ConeBeam(full_turn(views), 500.0, 1000.0, 64, 4, 1.0)):
+    for g in (
+        FanBeam(full_turn(views), 500.0, 1000.0, 64, 1.0),
+        ConeBeam(full_turn(views), 500.0, 1000.0, 64, 4, 1.0),
+    ):
         with pytest.raises(ValueError, match="too few"):
             angular_weights(g)
     if views < 3:
@@ -86,9 +91,13 @@ def test_views_that_lack_inside_of_the_scan_are_refused_or_named(caplog):
 
 def test_few_views_are_named(clean):
     assert "120 views are few" in sampling_warnings(clean.geometry)[0]
-    assert sampling_warnings(clean.geometry.select(slice(None))) == sampling_warnings(clean.geometry)
+    assert sampling_warnings(clean.geometry.select(slice(None))) == sampling_warnings(
+        clean.geometry
+    )
     assert sampling_warnings(replace(clean.geometry, angles=full_turn(1968))) == []
-    assert any("120 views are few" in text for text in reconstruct(clean, GRID, "fbp").report["warnings"])
+    assert any(
+        "120 views are few" in text for text in reconstruct(clean, GRID, "fbp").report["warnings"]
+    )
 
 
 @pytest.mark.parametrize("method", ["fbp", "pwls"])
@@ -121,7 +130,8 @@ def test_interleave_needs_a_quarter_column_opposite_rays_and_many_views(caplog):
 
 
 def test_pwls_says_when_its_volume_does_not_explain_the_data(clean, caplog):
-    """One scan at 2 s: a quarter of a column, 1 % of gain and a body beyond the grid are each found; noise is not."""
+    """One scan at 2 s: a quarter of a column, 1 % of gain and a body beyond the grid are each
+    found; noise is not."""
     scan = clean.with_noise(2.0, 2)
     report = reconstruct(scan, GRID, "pwls").report
     assert report["warnings"] == []
@@ -131,12 +141,16 @@ def test_pwls_says_when_its_volume_does_not_explain_the_data(clean, caplog):
 
     g = scan.geometry
     moved = replace(scan, geometry=replace(g, offset=(g.offset[0], g.offset[1] + 0.4 * g.pitch[1])))
-    assert any("rotation centre" in text for text in reconstruct(moved, GRID, "pwls").report["warnings"])
+    assert any(
+        "rotation centre" in text for text in reconstruct(moved, GRID, "pwls").report["warnings"]
+    )
     assert "rotation centre" in caplog.text
 
     drift = 1 + 0.01 * torch.linspace(0, 1, g.views)[:, None, None]
     drifted = replace(scan, counts=scan.counts * drift)
-    assert any("gain changed" in text for text in reconstruct(drifted, GRID, "pwls").report["warnings"])
+    assert any(
+        "gain changed" in text for text in reconstruct(drifted, GRID, "pwls").report["warnings"]
+    )
 
     metal = scan.counts.clone()
     metal[:, 4:8, 138:146] *= 0.02  # 8113 HU once, without a word
@@ -200,9 +214,12 @@ def test_wrong_descriptions_and_readings_are_named():
 
 @pytest.mark.parametrize("method", ["pwls", "mbir"])
 def test_iterative_methods_name_what_is_cut_off(method):
-    """Both take what the detector does not show for free: values were -28 to 22 HU off by MBIR, without a word."""
+    """Both take what the detector does not show for free: values were -28 to 22 HU off by MBIR,
+    without a word."""
     g, counts = _ellipse_scan(90, 60)
-    assert "first and the last column" in _warnings_of(counts[:, 15:45], replace(g, columns=30), method)
+    assert "first and the last column" in _warnings_of(
+        counts[:, 15:45], replace(g, columns=30), method
+    )
 
 
 def test_fbp_of_a_wrong_rotation_centre_is_named(clean):
@@ -218,7 +235,10 @@ def test_fbp_of_a_wrong_rotation_centre_is_named(clean):
 @pytest.mark.parametrize(
     ("change", "expected_text"),
     [
-        (lambda n, air, gain: n * torch.exp(0.1 - 0.1 * n / air), "above those of the known surround"),
+        (
+            lambda n, air, gain: n * torch.exp(0.1 - 0.1 * n / air),
+            "above those of the known surround",
+        ),
         (lambda n, air, gain: n + 0.001 * air, "above those of the known surround"),
         (lambda n, air, gain: n.clamp(max=float(n.mean())), "below those of the known surround"),
         (lambda n, air, gain: n * gain, "gains that the calibration in air did not see"),
@@ -227,20 +247,30 @@ def test_fbp_of_a_wrong_rotation_centre_is_named(clean):
     ids=["pile-up", "dark signal", "saturation", "gains", "sound"],
 )
 def test_a_window_that_does_not_read_its_surround_is_named(clean, change, expected_text):
-    """FBP of an inset took them for the inset's own, 30 to 120 HU off; PWLS and MBIR see them in their residual."""
+    """FBP of an inset took them for the inset's own, 30 to 120 HU off; PWLS and MBIR see them in
+    their residual."""
     air = clean._at_window(clean.air)
-    gain = clean.window.take(1 + 0.01 * torch.randn(clean.air.shape, generator=torch.Generator().manual_seed(0)))
+    gain = clean.window.take(
+        1 + 0.01 * torch.randn(clean.air.shape, generator=torch.Generator().manual_seed(0))
+    )
     changed = replace(clean, counts=change(clean.counts, air, gain))
     for seed in range(3):
         found = [
-            t for t in consistency_warnings(changed.with_noise(4.0, seed), GRID) if "surround" in t or "gains" in t
+            t
+            for t in consistency_warnings(changed.with_noise(4.0, seed), GRID)
+            if "surround" in t or "gains" in t
         ]
         assert len(found) == bool(expected_text)
         assert not expected_text or expected_text in found[0]
     # Noise of few counts, and readings that were lost, are no such thing.
     few = clean.with_noise(0.02, 0)
     lost = torch.rand(few.counts.shape, generator=torch.Generator().manual_seed(1)) < 0.1
-    for scan in (few, replace(clean.with_noise(4.0, 0), counts=clean.with_noise(4.0, 0).counts.masked_fill(lost, 0.0))):
+    for scan in (
+        few,
+        replace(
+            clean.with_noise(4.0, 0), counts=clean.with_noise(4.0, 0).counts.masked_fill(lost, 0.0)
+        ),
+    ):
         assert not [t for t in consistency_warnings(scan, GRID) if "surround" in t]
 
 
@@ -272,7 +302,13 @@ def test_fbp_names_metal_in_hu_and_knows_nothing_of_it_in_other_units():
         return 2 * np.sqrt(np.clip(radius**2 - columns**2, 0, None))
 
     grid = VolumeGrid((40, 40), 0.5)
-    for pin, unit, warned in ((0.0, {"mu_water": 0.02}, False), (0.4, {"mu_water": 0.02}, True), (0.4, {}, False)):
+    for pin, unit, warned in (
+        (0.0, {"mu_water": 0.02}, False),
+        (0.4, {"mu_water": 0.02}, True),
+        (0.4, {}, False),
+    ):
         lines = np.broadcast_to(0.02 * disc(12) + pin * disc(1.5), geometry.shape)
-        volume = reconstruct(Scan.from_line_integrals(lines, geometry, photons=1e5, **unit), grid, "fbp")
+        volume = reconstruct(
+            Scan.from_line_integrals(lines, geometry, photons=1e5, **unit), grid, "fbp"
+        )
         assert any("metal" in text for text in volume.report["warnings"]) is warned

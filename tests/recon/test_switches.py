@@ -56,7 +56,12 @@ def test_every_method_gives_the_same(name, method, wanted):
 
 
 def test_the_switches_are_back_afterwards():
-    with default_dtype(torch.float64), torch.device("meta"), np.errstate(all="raise"), torch.autocast("cpu"):
+    with (
+        default_dtype(torch.float64),
+        torch.device("meta"),
+        np.errstate(all="raise"),
+        torch.autocast("cpu"),
+    ):
         with unswitched():
             assert (torch.get_default_dtype(), torch.zeros(1).device.type) == (torch.float32, "cpu")
             assert not torch.is_autocast_enabled("cpu")

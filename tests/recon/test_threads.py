@@ -1,4 +1,5 @@
-"""One thread and two: our kernels give the same bits; torch's matrix products and convolutions stay within a bound."""
+"""One thread and two: our kernels give the same bits; torch's matrix products and convolutions
+stay within a bound."""
 
 import pytest
 import torch
@@ -31,7 +32,8 @@ def test_fbp_of_line_integrals(clean):
     g = clean.geometry.central_fan
     lines = torch.rand(g.shape, generator=torch.Generator().manual_seed(0))
     one, two = _both(lambda: fbp(lines, g, GRID.slice, outside=0.0))
-    # Whole rows are filtered by matrix products of 1500 terms, whose order BLAS chooses by the number of threads.
+    # Whole rows are filtered by matrix products of 1500 terms, whose order BLAS chooses by the
+    # number of threads.
     assert float((one - two).abs().max()) <= 1e-5 * float(one.abs().max())
 
 

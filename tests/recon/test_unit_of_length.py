@@ -1,4 +1,5 @@
-"""A scan in another unit of length, or of an object of another size on a scanner to match, gives the same image."""
+"""A scan in another unit of length, or of an object of another size on a scanner to match, gives
+the same image."""
 
 import math
 from dataclasses import replace
@@ -12,7 +13,16 @@ from recon import reconstruct
 from recon.gram.gram import information_at
 from recon.least_squares.field_model import FieldModel
 from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
-from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, Scan, VolumeGrid, acquire, full_turn
+from torchpcct import (
+    ConeBeam,
+    FanBeam,
+    ParallelBeam,
+    Projector,
+    Scan,
+    VolumeGrid,
+    acquire,
+    full_turn,
+)
 from torchpcct.vector_geometry import VectorGeometry
 
 SCALES = [1e-7, 2.54, 1e6]
@@ -31,7 +41,9 @@ def chords(geometry):
 
 def stretched(geometry, k):
     lengths = ("sod", "sdd", "pitch", "offset")
-    changes = {n: np.multiply(getattr(geometry, n), k).tolist() for n in lengths if hasattr(geometry, n)}
+    changes = {
+        n: np.multiply(getattr(geometry, n), k).tolist() for n in lengths if hasattr(geometry, n)
+    }
     return replace(geometry, **changes)
 
 
@@ -43,14 +55,24 @@ def wobbling(geometry, k):
 
 
 CASES = {
-    "parallel": (ParallelBeam(np.arange(45) * math.pi / 45, 44, 1.0, 0.1), VolumeGrid((40, 40), 1.0), stretched),
+    "parallel": (
+        ParallelBeam(np.arange(45) * math.pi / 45, 44, 1.0, 0.1),
+        VolumeGrid((40, 40), 1.0),
+        stretched,
+    ),
     "fan": (FAN, VolumeGrid((40, 40), 1.0), stretched),
     "vectors": (FAN, VolumeGrid((40, 40), 1.0), wobbling),
-    "cone": (ConeBeam(full_turn(45), 200.0, 300.0, 46, 8, 1.4), VolumeGrid((4, 40, 40), 1.0), stretched),
-    "inset": (
-        ConeBeam(full_turn(45), 200.0, 300.0, 56, 8, 1.2), VolumeGrid((3, 12, 12), 0.8, (0.0, 3.0, -2.0)), stretched
+    "cone": (
+        ConeBeam(full_turn(45), 200.0, 300.0, 46, 8, 1.4),
+        VolumeGrid((4, 40, 40), 1.0),
+        stretched,
     ),
-}  # fmt: skip
+    "inset": (
+        ConeBeam(full_turn(45), 200.0, 300.0, 56, 8, 1.2),
+        VolumeGrid((3, 12, 12), 0.8, (0.0, 3.0, -2.0)),
+        stretched,
+    ),
+}
 
 
 def scan(name, k):
@@ -70,7 +92,9 @@ def test_fbp_and_pwls(name, method):
         assert len(found.report["warnings"]) == len(wanted.report["warnings"])
 
 
-@pytest.mark.parametrize(("name", "method"), [("parallel", "fbp"), ("vectors", "pwls"), ("cone", "pwls")])
+@pytest.mark.parametrize(
+    ("name", "method"), [("parallel", "fbp"), ("vectors", "pwls"), ("cone", "pwls")]
+)
 def test_scans_that_do_not_know_water(name, method):
     """Volumes in mm⁻¹: as many times smaller as lengths are larger."""
     wanted = reconstruct(*without_water(name, 1.0), method)
@@ -88,7 +112,9 @@ def without_water(name, k):
 
 def test_mbir_of_a_field():
     wanted = reconstruct(*scan("parallel", 1.0), "mbir")
-    torch.testing.assert_close(reconstruct(*scan("parallel", 1e-3), "mbir").data, wanted.data, atol=0.1, rtol=0)
+    torch.testing.assert_close(
+        reconstruct(*scan("parallel", 1e-3), "mbir").data, wanted.data, atol=0.1, rtol=0
+    )
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +130,10 @@ def test_insets_of_windowed_scans(windowed, k):
     other = replace(windowed, geometry=stretched(windowed.geometry, k), linearisation=linearisation)
     there = VolumeGrid(grid.shape, 0.4 * k, [c * k for c in CENTER])
     for method in ("fbp", "pwls"):
-        wanted, found = reconstruct(windowed, grid, method).data, reconstruct(other, there, method).data
+        wanted, found = (
+            reconstruct(windowed, grid, method).data,
+            reconstruct(other, there, method).data,
+        )
         torch.testing.assert_close(found, wanted, atol=0.1, rtol=0)
     with pytest.raises(ValueError, match="check that lengths are in mm"):
         reconstruct(other, there, "mbir")
@@ -112,10 +141,13 @@ def test_insets_of_windowed_scans(windowed, k):
 
 @pytest.mark.parametrize("voxel", [0.05, 0.4, 1.2, 1.67, 2.4, 3.0, 10.0])
 def test_information_is_positive_for_voxels_of_any_size(voxel):
-    """At any frequency, also where voxels or grid do not hold it: once negative for voxels of 1.2 to 3 mm."""
+    """At any frequency, also where voxels or grid do not hold it: once negative for voxels of
+    1.2 to 3 mm."""
     n = max(1, round(24 / voxel)) if voxel >= 1 else 12
     geometry = ConeBeam(full_turn(40), 500.0, 900.0, 40, 6, 3.0)
-    model = FieldModel(Projector(geometry, VolumeGrid((3, n, n), voxel)), torch.full(geometry.shape, 1e4))
+    model = FieldModel(
+        Projector(geometry, VolumeGrid((3, n, n), voxel)), torch.full(geometry.shape, 1e4)
+    )
     for frequency in (1e-3, 0.1, 0.5, 5.0):
         assert model.information(2e-5, frequency) > 0
 
@@ -132,7 +164,9 @@ def test_information_of_a_voxel_alone():
 def test_grids_of_a_few_voxels(shape):
     geometry = FanBeam(full_turn(20), 50.0, 80.0, 12, 1.6)
     counts = np.full(geometry.shape, 9e3)
-    volume = reconstruct(Scan.from_counts(counts, geometry, air=1e4, mu_water=0.02), VolumeGrid(shape, 1.0), "pwls")
+    volume = reconstruct(
+        Scan.from_counts(counts, geometry, air=1e4, mu_water=0.02), VolumeGrid(shape, 1.0), "pwls"
+    )
     assert torch.isfinite(volume.data).all()
 
 
@@ -140,9 +174,13 @@ def test_a_prior_is_stretched_with_its_scan():
     """R keeps its value, and the ring on which the data are asked."""
     for dimensions in (2, 3):
         for prior in (DEFAULT_PRIOR, QGGMRF(0.3, 20.0)):
-            x = torch.rand((5,) * dimensions, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+            x = torch.rand(
+                (5,) * dimensions, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+            )
             k = 7.3
             one = prior.bind(2.0, (0.5,) * dimensions, 2e-5).value(x)
             # The information, 1 / (HU² mm³), at the frequency that voxels hold alike.
-            other = prior.stretched(k, dimensions).bind(2.0 / k**dimensions, (0.5 * k,) * dimensions, 2e-5 / k)
+            other = prior.stretched(k, dimensions).bind(
+                2.0 / k**dimensions, (0.5 * k,) * dimensions, 2e-5 / k
+            )
             assert other.value(x / k) == pytest.approx(float(one), rel=1e-9)

@@ -1,4 +1,5 @@
-"""Scans whose geometry is given view by view: readings, files, methods and command line, against a ball's chords."""
+"""Scans whose geometry is given view by view: readings, files, methods and command line, against
+a ball's chords."""
 
 import json
 import math
@@ -22,18 +23,25 @@ from torchpcct.vector_geometry import helical_motion
 MU = 0.02
 BALL = [Ellipsoid((1.0, -2.0, 0.5), 8.0, value=MU)]
 CONE = ConeBeam(full_turn(60), 150.0, 250.0, 44, 36, (1.3, 1.2))
-ROLL, TILT = math.radians(3.0), math.radians(4.0)
+ROLL = math.radians(3.0)
+TILT = math.radians(4.0)
 WOBBLING = VectorGeometry.of(CONE).turned(ROLL, TILT).shifted(np.tile([0.5, -0.5], 30), 0.25)
 HELIX = VectorGeometry.of(CONE, helical_motion(CONE, 30.0, -15.0))
 
 
 def scan_of(geometry, bodies=BALL, sub=1):
-    return Scan.from_line_integrals(vector_lines(geometry, bodies, sub), geometry, photons=1e6, mu_water=MU)
+    return Scan.from_line_integrals(
+        vector_lines(geometry, bodies, sub), geometry, photons=1e6, mu_water=MU
+    )
 
 
 def test_one_ray_by_hand():
-    """The middle ray of 3 × 3 cells through a ball of radius 8 mm at 5 mm from it: 2 √39 mm of water."""
-    vectors = [[100.0, 5, 0, -50, 5, 0, 0, 1, 0, 0, 0, 1], [5.0, 100, 0, 5, -50, 0, 1, 0, 0, 0, 0, 1]]
+    """The middle ray of 3 × 3 cells through a ball of radius 8 mm at 5 mm from it: 2 √39 mm of
+    water."""
+    vectors = [
+        [100.0, 5, 0, -50, 5, 0, 0, 1, 0, 0, 0, 1],
+        [5.0, 100, 0, 5, -50, 0, 1, 0, 0, 0, 0, 1],
+    ]
     geometry = VectorGeometry(vectors, 3, 3)
     chord = 2.0 * math.sqrt(39.0) * MU
     assert chord == pytest.approx(0.249800, abs=1e-6)
@@ -43,17 +51,22 @@ def test_one_ray_by_hand():
     assert scan.weights().shape == (2, 3, 3)
     assert geometry.cell == pytest.approx(100.125**2 / 15000.0, rel=1e-4)
     distance, height, climb = geometry.border_rays()
-    # From (100, 5) to the outer edge at (-50, 6.5): (100 · 6.5 + 50 · 5) / 150.0075 mm beside the axis.
+    # From (100, 5) to the outer edge at (-50, 6.5): (100 · 6.5 + 50 · 5) / 150.0075 mm beside the
+    # axis.
     assert distance.max() == pytest.approx(900.0 / math.hypot(150.0, 1.5), rel=1e-9)
     assert np.abs(climb).max() == pytest.approx(0.01, rel=1e-3)
     assert np.abs(height).max() == pytest.approx(1.0, abs=0.01)
-    with pytest.raises(ValueError, match=r"readings have the shape \(2, 3, 4\), the geometry needs"):
+    with pytest.raises(
+        ValueError, match=r"readings have the shape \(2, 3, 4\), the geometry needs"
+    ):
         Scan.from_counts(np.ones((2, 3, 4)), geometry, air=1.0)
 
 
 def helix():
     """Rows that see 8 of the grid's 24 mm at a time, over three turns of 8 mm."""
-    cone = ConeBeam(np.linspace(0, 6 * math.pi, 72, endpoint=False), 150.0, 250.0, 28, 6, (2.2, 2.0))
+    cone = ConeBeam(
+        np.linspace(0, 6 * math.pi, 72, endpoint=False), 150.0, 250.0, 28, 6, (2.2, 2.0)
+    )
     return VectorGeometry.of(cone, helical_motion(cone, 8.0, -12.0))
 
 
@@ -71,7 +84,9 @@ def test_pwls_of_what_fbp_refuses_or_bends(make):
     geometry, grid = make(), VolumeGrid((12, 12, 12), 2.0)
     body = [Gaussian((1.0, 2.0, -1.0), (5.0, 3.5, 4.0), value=MU)]
     scan = scan_of(geometry, body, 2)
-    found = reconstruct(scan, grid, "pwls", prior=QGGMRF(strength=0.02, threshold=3000.0), tolerance=2.0)
+    found = reconstruct(
+        scan, grid, "pwls", prior=QGGMRF(strength=0.02, threshold=3000.0), tolerance=2.0
+    )
     assert found.report["converged"]
     error = (found.data.numpy() - 1000.0 * (rasterize(grid, body, 3) / MU - 1.0))[1:-1, 1:-1, 1:-1]
     assert np.sqrt((error**2).mean()) < 20.0  # of the body itself: 170 HU
@@ -94,7 +109,8 @@ def test_the_grid_grows_to_what_the_rays_cross():
     """Of a circle given view by view as of the circle; of a helix by its travel."""
     small = VolumeGrid((4, 8, 8), 2.0)
     circle, vectors = larger_grid(small, CONE), larger_grid(small, VectorGeometry.of(CONE))
-    # 22 cells of 1.2 mm at 250 mm: 150 · 26.4 / √(250² + 26.4²) mm; the grid of the circle counts cell centres.
+    # 22 cells of 1.2 mm at 250 mm: 150 · 26.4 / √(250² + 26.4²) mm; the grid of the circle counts
+    # cell centres.
     assert VectorGeometry.of(CONE).border_rays()[0].max() == pytest.approx(15.7524, abs=1e-4)
     assert [abs(a - b) <= 2 for a, b in zip(circle.shape, vectors.shape, strict=True)] == [True] * 3
     helix = larger_grid(small, HELIX)
@@ -112,8 +128,15 @@ def test_halves_of_a_helix_take_every_second_view_of_each_turn():
 
 
 def test_geometries_in_yaml(tmp_path):
-    circle = {"kind": "cone", "angles_deg": {"step": 6, "count": 60}, "sod": 150, "sdd": 250, "columns": 44, "rows": 36,
-              "pitch": [1.3, 1.2]}  # fmt: skip
+    circle = {
+        "kind": "cone",
+        "angles_deg": {"step": 6, "count": 60},
+        "sod": 150,
+        "sdd": 250,
+        "columns": 44,
+        "rows": 36,
+        "pitch": [1.3, 1.2],
+    }
     np.savetxt(tmp_path / "jitter.txt", np.tile([0.5, -0.5], 30))
     pose = {"roll_deg": 3.0, "tilt_deg": 4.0, "columns": "jitter.txt", "rows": 0.25}
     found = geometry_of({**circle, "pose": pose}, tmp_path)
@@ -127,8 +150,14 @@ def test_geometries_in_yaml(tmp_path):
     refused(
         ("12 numbers per view need rows", lambda: geometry_of(given, tmp_path)),
         ("geometry needs columns", lambda: geometry_of({"kind": "vectors", "vectors": []})),
-        (r"geometry\.pose must be a mapping of roll_deg", lambda: geometry_of({**circle, "pose": {"roll": 3.0}})),
-        ("first height of a helix: give feed", lambda: geometry_of({**circle, "pose": {"start": 3.0}})),
+        (
+            r"geometry\.pose must be a mapping of roll_deg",
+            lambda: geometry_of({**circle, "pose": {"roll": 3.0}}),
+        ),
+        (
+            "first height of a helix: give feed",
+            lambda: geometry_of({**circle, "pose": {"start": 3.0}}),
+        ),
     )
 
 
@@ -148,8 +177,12 @@ def test_the_command_line_takes_vectors(here, cli):
     np.save("lines.npy", lines)
     (here / "stack.yaml").write_text("readings: lines.npy\nkind: line_integrals\nmu_water: 0.02\n")
     assert open_scan(here / "stack.yaml", WOBBLING).geometry == WOBBLING
-    with pytest.raises(ValueError, match=r"holds its geometry: leave out geometry, or give a VectorGeometry"):
+    with pytest.raises(
+        ValueError, match=r"holds its geometry: leave out geometry, or give a VectorGeometry"
+    ):
         open_scan(here / "scan.h5", CONE)
-    slices = Scan.from_line_integrals(np.moveaxis(lines, 1, 0), CONE.central_fan, photons=1e6, mu_water=MU)
+    slices = Scan.from_line_integrals(
+        np.moveaxis(lines, 1, 0), CONE.central_fan, photons=1e6, mu_water=MU
+    )
     slices.save("slices.h5")
     assert torch.equal(open_scan("slices.h5", WOBBLING).counts, slices.counts.movedim(0, 1))

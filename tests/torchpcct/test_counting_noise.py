@@ -26,7 +26,10 @@ def assert_poisson(draws, mean):
 
 @pytest.mark.parametrize("mean", [0.03, 0.7, 4.0, 9.99, 10.0, 37.3, 115.0, 16070.0, 3e6])
 def test_poisson_distribution(mean):
-    assert_poisson(poisson(torch.full((1, 400_000), mean, dtype=torch.float64), [0], seed=3).numpy().ravel(), mean)
+    assert_poisson(
+        poisson(torch.full((1, 400_000), mean, dtype=torch.float64), [0], seed=3).numpy().ravel(),
+        mean,
+    )
 
 
 def test_seeds_and_neighbours_are_uncorrelated():
@@ -61,7 +64,8 @@ def test_thinned_poisson_counts_are_poisson_of_the_lower_dose(mean, fraction):
     assert (draws <= full).all()
     low, rest = draws.numpy().ravel(), (full - draws).numpy().ravel()
     assert_poisson(low, mean * fraction)
-    # What stays and what goes of Poisson counts are independent, also where both were drawn with one seed.
+    # What stays and what goes of Poisson counts are independent, also where both were drawn with
+    # one seed.
     assert abs(np.corrcoef(low, rest)[0, 1]) < 4.5 / np.sqrt(n)
 
 
@@ -69,11 +73,17 @@ def test_thinned_readings_that_are_no_counts_have_the_right_moments():
     n, fraction, mean, quantum, electronic = 200_000, 0.3, 40.0, 2.5, 3.0
     signal = quantum * poisson(torch.full((1, n), mean, dtype=torch.float64), [0], seed=1)
     signal += electronic * normal((1, n), [0], 1, torch.float64, purpose=1)
-    low = thinned(signal, [0], 1, fraction, torch.full_like(signal, quantum), electronic).numpy().ravel()
+    low = (
+        thinned(signal, [0], 1, fraction, torch.full_like(signal, quantum), electronic)
+        .numpy()
+        .ravel()
+    )
     expected, variance = fraction * quantum * mean, fraction * quantum**2 * mean + electronic**2
     assert abs(low.mean() - expected) < 4.5 * np.sqrt(variance / n)
     # Rounding to whole quanta adds up to a quarter of quantum² · fraction².
-    assert -0.03 * variance < low.var() - variance < 0.03 * variance + 0.25 * (quantum * fraction) ** 2
+    assert (
+        -0.03 * variance < low.var() - variance < 0.03 * variance + 0.25 * (quantum * fraction) ** 2
+    )
 
 
 @pytest.mark.parametrize("fraction", [0.2, 0.7])
@@ -82,21 +92,31 @@ def test_electronic_noise_is_the_same_at_any_dose(fraction):
     n, mean, quantum, electronic = 100_000, 4000.0, 0.5, 40.0
     signal = quantum * poisson(torch.full((1, n), mean, dtype=torch.float64), [0], seed=1)
     signal += electronic * normal((1, n), [0], 1, torch.float64, purpose=1)
-    low = thinned(signal, [0], 1, fraction, torch.full_like(signal, quantum), electronic).numpy().ravel()
+    low = (
+        thinned(signal, [0], 1, fraction, torch.full_like(signal, quantum), electronic)
+        .numpy()
+        .ravel()
+    )
     variance = fraction * quantum**2 * mean + electronic**2
-    assert abs(low.var() / variance - 1.0) < 4.5 * np.sqrt(2.0 / n) + 0.25 * (quantum * fraction) ** 2 / variance
+    assert (
+        abs(low.var() / variance - 1.0)
+        < 4.5 * np.sqrt(2.0 / n) + 0.25 * (quantum * fraction) ** 2 / variance
+    )
 
 
 def test_a_window_is_thinned_as_the_whole():
     counts = poisson(torch.full((6, 50), 80.0), np.arange(6) * 50, seed=11)
     full = thinned(counts, np.arange(6) * 50, 4, 0.6)
-    assert torch.equal(thinned(counts[2:5, 7:30], np.arange(2, 5) * 50 + 7, 4, 0.6), full[2:5, 7:30])
+    assert torch.equal(
+        thinned(counts[2:5, 7:30], np.arange(2, 5) * 50 + 7, 4, 0.6), full[2:5, 7:30]
+    )
 
 
 @pytest.mark.parametrize("mean", [2.0**31, 9.9e11, 1e12, 2.0**53, 2.0**63, 2.0**64, 1e25])
 @pytest.mark.parametrize("fraction", [1e-12, 1e-9, 1e-3, 0.4, 0.97])
 def test_counts_beyond_every_integer_keep_mean_and_variance(mean, fraction):
-    """No whole number of 32, 53 or 63 bits ends them, and none is negative or more than there were."""
+    """No whole number of 32, 53 or 63 bits ends them, and none is negative or more than there
+    were."""
     n = 20_000
     full = torch.full((1, n), mean, dtype=torch.float64)
     draws = poisson(full, [0], seed=3).numpy()
@@ -107,7 +127,9 @@ def test_counts_beyond_every_integer_keep_mean_and_variance(mean, fraction):
         (draws, mean, mean),
         (kept, mean * fraction, mean * fraction * (1 - fraction)),
     ):
-        assert abs((values - centre).mean()) < 4.5 * np.sqrt(variance / n) + 1e-9 * np.sqrt(variance)
+        assert abs((values - centre).mean()) < 4.5 * np.sqrt(variance / n) + 1e-9 * np.sqrt(
+            variance
+        )
         # Fourth moment of few counts: variance · (1 + 3 variance).
         assert abs(values.var() / variance - 1) < 4.5 * np.sqrt((2 + 1 / variance) / n)
 
@@ -116,4 +138,6 @@ def test_infinite_expectations_are_no_numbers():
     values = torch.tensor([[np.inf, np.nan, 0.0, 5.0]], dtype=torch.float64)
     assert torch.isnan(poisson(values, [0], 0))[0].tolist() == [True, True, False, False]
     assert torch.isnan(thinned(values, [0], 0, 0.5))[0].tolist() == [True, True, False, False]
-    assert torch.isnan(poisson(torch.full((1, 2), 1e300, dtype=torch.float64), [0], 0, scale=1e10)).all()
+    assert torch.isnan(
+        poisson(torch.full((1, 2), 1e300, dtype=torch.float64), [0], 0, scale=1e10)
+    ).all()

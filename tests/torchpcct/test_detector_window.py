@@ -27,13 +27,19 @@ def test_a_margin_stops_at_the_outer_window():
 
 
 def test_cropping_keeps_each_reading_at_its_cell():
-    outer, inner = DetectorWindow(np.array([2, 4]), 6, 1, 3), DetectorWindow(np.array([4, 5]), 3, 2, 1)
+    outer, inner = (
+        DetectorWindow(np.array([2, 4]), 6, 1, 3),
+        DetectorWindow(np.array([4, 5]), 3, 2, 1),
+    )
     cells = torch.arange(5 * 12.0).reshape(5, 12)
     assert torch.equal(outer.crop(outer.take(cells), inner), inner.take(cells))
 
 
 def test_the_full_window_is_the_whole_detector():
-    for geometry in (FanBeam([0.0, 1.0], 50.0, 90.0, 7, 1.0), ConeBeam([0.0, 1.0, 2.0], 50.0, 90.0, 7, 4, 1.0)):
+    for geometry in (
+        FanBeam([0.0, 1.0], 50.0, 90.0, 7, 1.0),
+        ConeBeam([0.0, 1.0, 2.0], 50.0, 90.0, 7, 4, 1.0),
+    ):
         full = DetectorWindow.full(geometry)
         cells = torch.arange(28.0).reshape(4, 7)[: full.rows]
         assert torch.equal(full.take(cells), cells.expand(geometry.views, -1, -1))

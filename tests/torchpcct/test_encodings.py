@@ -1,4 +1,5 @@
-"""Terminals that are no UTF-8: containers, cron, Windows code pages. What they lack is replaced, nothing ends."""
+"""Terminals that are no UTF-8: containers, cron, Windows code pages. What they lack is replaced,
+nothing ends."""
 
 import os
 import subprocess
@@ -15,16 +16,27 @@ def test_what_the_terminal_cannot_show_is_replaced(encoding, stream):
         f"print('done: \\u27e8 ± µ \\u2026', file=sys.{stream})"
     )
     environment = os.environ | {"PYTHONIOENCODING": encoding}
-    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=True)
+    run = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, check=True
+    )
     assert getattr(run, stream).startswith(b"done: ?")
 
 
 @pytest.mark.parametrize(
-    "words", [["--help"], ["doctor", "--help"], ["info", "no such file"], ["train", "--help"], ["study", "--help"]]
+    "words",
+    [
+        ["--help"],
+        ["doctor", "--help"],
+        ["info", "no such file"],
+        ["train", "--help"],
+        ["study", "--help"],
+    ],
 )
 def test_commands_speak_ascii(words):
     environment = os.environ | {"PYTHONIOENCODING": "ascii", "LANG": "C"}
-    run = subprocess.run([sys.executable, "-m", "recon.cli", *words], env=environment, capture_output=True)
+    run = subprocess.run(
+        [sys.executable, "-m", "recon.cli", *words], env=environment, capture_output=True
+    )
     said = run.stdout + run.stderr
     assert run.returncode in (0, 2)
     assert b"codec" not in said

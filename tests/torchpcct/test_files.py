@@ -1,4 +1,5 @@
-"""Files that appear whole or not at all, whatever the disk, other writers and the user's keyboard do meanwhile."""
+"""Files that appear whole or not at all, whatever the disk, other writers and the user's
+keyboard do meanwhile."""
 
 import os
 import signal
@@ -32,8 +33,12 @@ def objects(path):  # more structure than HDF5 keeps in memory
         for k in range(600):
             file.create_group(f"g{k}").attrs["text"] = "t" * 1000
 numbers = {"a": torch.rand(40000)}
-writers = {"s.h5": scan.save, "o.h5": objects, "w.safetensors": lambda path: write_tensors(path, "k", numbers, {}),
-           "p": lambda path: Store(folder).piece("p", "", lambda: {"a": rng.random(40000)})}
+writers = {
+    "s.h5": scan.save,
+    "o.h5": objects,
+    "w.safetensors": lambda path: write_tensors(path, "k", numbers, {}),
+    "p": lambda path: Store(folder).piece("p", "", lambda: {"a": rng.random(40000)}),
+}
 for size in (600, 5000, 40000):
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
     for name in (*writers, "v.h5", "v.nii", "v.nii.gz", "v.mha", "small.mha", "series"):
@@ -48,11 +53,14 @@ for size in (600, 5000, 40000):
 
 
 def test_what_cannot_be_written_is_an_error_in_one_sentence_and_leaves_nothing(tmp_path):
-    """A limit on the size of files, for a full disk: every writer fails at several moments, HDF5 not at the end."""
+    """A limit on the size of files, for a full disk: every writer fails at several moments, HDF5
+    not at the end."""
     run = run_python(FULL, tmp_path)
     output = run.stdout.splitlines()
     assert len(output) == 3 * 10 - 3
-    assert [s for s in output if not (s.startswith("cannot write ") and s.endswith("File too large"))] == []
+    assert [
+        s for s in output if not (s.startswith("cannot write ") and s.endswith("File too large"))
+    ] == []
     assert run.stderr == ""
     assert list(tmp_path.iterdir()) == []
 
@@ -82,7 +90,10 @@ def test_a_study_outlives_another_one_that_clears_the_same_folder(tmp_path, monk
     other.start()
     try:
         store = Store(tmp_path / "pieces")
-        found = [store.piece(f"deep/{k % 3}", str(k), lambda k=k: {"a": np.full(9, k)})["a"][0] for k in range(150)]
+        found = [
+            store.piece(f"deep/{k % 3}", str(k), lambda k=k: {"a": np.full(9, k)})["a"][0]
+            for k in range(150)
+        ]
     finally:
         done.set()
         other.join()
@@ -92,7 +103,8 @@ def test_a_study_outlives_another_one_that_clears_the_same_folder(tmp_path, monk
 
 
 def test_an_interruption_while_hdf5_writes_waits_for_it(tmp_path):
-    """Ctrl-C in what HDF5 asks of the file would be a write that is lost, and a file that is sealed without it."""
+    """Ctrl-C in what HDF5 asks of the file would be a write that is lost, and a file that is
+    sealed without it."""
     path = tmp_path / "f.h5"
     # A shell that starts commands in the background has them ignore Ctrl-C.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -1,4 +1,5 @@
-"""Scans that we did not simulate: raw readings of other detectors, and line integrals of other software."""
+"""Scans that we did not simulate: raw readings of other detectors, and line integrals of other
+software."""
 
 import math
 
@@ -22,7 +23,11 @@ CYLINDER = GEOMETRIES["cone"]
 
 
 def grid_of(geometry):
-    return VolumeGrid((2, 24, 24), (1.0, 2.0, 2.0)) if isinstance(geometry, ConeBeam) else VolumeGrid((24, 24), 2.0)
+    return (
+        VolumeGrid((2, 24, 24), (1.0, 2.0, 2.0))
+        if isinstance(geometry, ConeBeam)
+        else VolumeGrid((24, 24), 2.0)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +43,9 @@ def test_raw_readings_give_back_their_line_integrals(kind, lines):
     dark, flux, gain = rng.uniform(90, 110, g.shape[1:]), rng.uniform(0.9, 1.1, g.views), 3.5
     beam = flux.reshape(-1, *[1] * (len(g.shape) - 1))
     raw = dark + gain * (air * beam * np.exp(-p))
-    scan = Scan.from_counts(raw, g, air=dark + gain * air, dark=dark, gain=gain, flux=flux, mu_water=MU)
+    scan = Scan.from_counts(
+        raw, g, air=dark + gain * air, dark=dark, gain=gain, flux=flux, mu_water=MU
+    )
     np.testing.assert_allclose(scan.line_integrals().numpy(), p, atol=3e-5)
     inside = reconstruct(scan, grid_of(g), "fbp").data[..., 10:14, 10:14]
     assert float(inside.abs().max()) < 10  # water reads 0 HU
@@ -46,7 +53,9 @@ def test_raw_readings_give_back_their_line_integrals(kind, lines):
     bare = Scan.from_counts(raw, g, air=dark + gain * air, dark=dark, gain=gain, flux=flux)
     volume = reconstruct(bare, grid_of(g), "fbp")
     assert volume.unit == "mm^-1"
-    torch.testing.assert_close(volume.data[..., 10:14, 10:14], torch.full_like(inside, MU), rtol=0.01, atol=0)
+    torch.testing.assert_close(
+        volume.data[..., 10:14, 10:14], torch.full_like(inside, MU), rtol=0.01, atol=0
+    )
 
 
 @pytest.mark.parametrize("kind", GEOMETRIES)
@@ -64,14 +73,19 @@ def test_slices_are_reconstructed_one_by_one(lines):
     stack = Scan.from_line_integrals(np.stack([p, 0.5 * p]), g, photons=1e5, mu_water=MU)
     single = Scan.from_line_integrals(p, g, photons=1e5, mu_water=MU)
     volume = reconstruct(stack, VolumeGrid((2, 24, 24), 2.0), "fbp").data
-    torch.testing.assert_close(volume[0], reconstruct(single, VolumeGrid((24, 24), 2.0), "fbp").data, atol=0.1, rtol=0)
+    torch.testing.assert_close(
+        volume[0], reconstruct(single, VolumeGrid((24, 24), 2.0), "fbp").data, atol=0.1, rtol=0
+    )
     torch.testing.assert_close(volume[1], 0.5 * volume[0] - 500.0, atol=0.2, rtol=0)
-    with pytest.raises(ValueError, match=r"2 slices needs a grid of shape \(2, 'y', 'x'\), got \(3, 24, 24\)"):
+    with pytest.raises(
+        ValueError, match=r"2 slices needs a grid of shape \(2, 'y', 'x'\), got \(3, 24, 24\)"
+    ):
         reconstruct(stack, VolumeGrid((3, 24, 24), 2.0), "fbp")
 
 
 def test_dead_cells_do_not_spread(lines):
-    """Masked, NaN, silent and air-less columns: within 2 % of a detector without them, and no weight."""
+    """Masked, NaN, silent and air-less columns: within 2 % of a detector without them, and no
+    weight."""
     g, p = GEOMETRIES["fan"], lines["fan"]
     counts, air = 1e6 * np.exp(-p), np.full(g.columns, 1e6)
     whole = reconstruct(Scan.from_counts(counts, g, air=air, mu_water=MU), grid_of(g), "fbp").data
@@ -89,7 +103,9 @@ def test_dead_cells_do_not_spread(lines):
 def test_a_photon_transfer_finds_the_gain():
     """50 air frames of 64 × 3 cells: the gain's standard error is √(2 / 49 / 192) = 1.5 %."""
     rng = np.random.default_rng(3)
-    frames = 100.0 + 7.0 * rng.poisson(4000.0, (50, *CYLINDER.shape[1:])) * rng.uniform(0.98, 1.02, (50, 1, 1))
+    frames = 100.0 + 7.0 * rng.poisson(4000.0, (50, *CYLINDER.shape[1:])) * rng.uniform(
+        0.98, 1.02, (50, 1, 1)
+    )
     raw = 100.0 + 7.0 * rng.poisson(500.0, CYLINDER.shape)
     scan = Scan.from_counts(raw, CYLINDER, air=frames, dark=100.0)
     assert scan.info["signal_of_one_photon"] == pytest.approx(7.0, rel=0.06)
@@ -111,7 +127,8 @@ def test_dark_frames_give_the_electronic_noise():
 
 
 def test_weights_are_inverse_variances_and_do_not_follow_the_noise():
-    """Weighting by the noisy counts themselves biases the mean of the logarithm by 1 / N, smooth weights far less."""
+    """Weighting by the noisy counts themselves biases the mean of the logarithm by 1 / N, smooth
+    weights far less."""
     mean, g = 20.0, ConeBeam(full_turn(60), 300.0, 500.0, 64, 9, 1.0)
     counts = np.random.default_rng(5).poisson(mean, g.shape).astype(float)
     scan = Scan.from_counts(counts, g, air=1000.0)
@@ -126,7 +143,9 @@ def test_weights_are_inverse_variances_and_do_not_follow_the_noise():
 
 def test_photons_are_estimated_from_noise():
     p = torch.linspace(0, 3, 64) + torch.zeros(GEOMETRIES["fan"].views, 1)
-    noisy = -torch.log(torch.poisson(2e4 * torch.exp(-p), generator=torch.Generator().manual_seed(0)) / 2e4)
+    noisy = -torch.log(
+        torch.poisson(2e4 * torch.exp(-p), generator=torch.Generator().manual_seed(0)) / 2e4
+    )
     scan = Scan.from_line_integrals(noisy, GEOMETRIES["fan"])
     assert float(scan.air[0]) == pytest.approx(2e4, rel=0.1)
     assert scan.info["photons"].startswith("estimated")
@@ -135,11 +154,15 @@ def test_photons_are_estimated_from_noise():
 def test_a_polynomial_linearises():
     g, t = GEOMETRIES["fan"], np.linspace(0, 2, 64)
     p = np.broadcast_to(t - 0.05 * t**2, (g.views, 64))
-    scan = Scan.from_line_integrals(p, g, photons=1e6, linearisation=(1.0, 0.05, 0.005), mu_water=MU)
+    scan = Scan.from_line_integrals(
+        p, g, photons=1e6, linearisation=(1.0, 0.05, 0.005), mu_water=MU
+    )
     expected = p + 0.05 * p**2 + 0.005 * p**3
     np.testing.assert_allclose(scan.line_integrals().numpy(), expected, atol=2e-6)
     slope = 1 + 0.1 * p + 0.015 * p**2
-    np.testing.assert_allclose(scan.weights()[:, 4:-4], (1e6 * np.exp(-p) / slope**2)[:, 4:-4], rtol=0.01)
+    np.testing.assert_allclose(
+        scan.weights()[:, 4:-4], (1e6 * np.exp(-p) / slope**2)[:, 4:-4], rtol=0.01
+    )
 
 
 FIVE = np.full((90, 64), 5.0)
@@ -150,7 +173,10 @@ def scanned(readings=FIVE, air=10.0, **given):
 
 
 test_bad_readings_are_named = refusals(
-    (r"shape \(3, 64\), the geometry needs \(\[slices,\] 90, 64\)", lambda: scanned(np.zeros((3, 64)))),
+    (
+        r"shape \(3, 64\), the geometry needs \(\[slices,\] 90, 64\)",
+        lambda: scanned(np.zeros((3, 64))),
+    ),
     ("give dark=, or use from_line_integrals", lambda: scanned(np.full((90, 64), -1.0))),
     ("air must be one number, or have the shape", lambda: scanned(air=np.ones((5, 5)))),
     ("air is not brighter than dark", lambda: scanned(air=1.0, dark=5.0)),
@@ -158,22 +184,34 @@ test_bad_readings_are_named = refusals(
     ("flux must be finite and greater than 0", lambda: scanned(flux=np.zeros(90))),
     ("dead must have the shape", lambda: scanned(dead=np.ones(7, bool))),
     ("mu_water must be greater than 0", lambda: scanned(mu_water=-1.0)),
-    ("no line integrals", lambda: Scan.from_line_integrals(np.full((90, 64), 4000.0), GEOMETRIES["fan"])),
+    (
+        "no line integrals",
+        lambda: Scan.from_line_integrals(np.full((90, 64), 4000.0), GEOMETRIES["fan"]),
+    ),
     ("real numbers", lambda: Scan.from_line_integrals(np.full((90, 64), "x"), GEOMETRIES["fan"])),
-    ("mask of bool", lambda: Scan.from_line_integrals(np.ones((90, 64)), GEOMETRIES["fan"], dead=np.zeros(64))),
+    (
+        "mask of bool",
+        lambda: Scan.from_line_integrals(np.ones((90, 64)), GEOMETRIES["fan"], dead=np.zeros(64)),
+    ),
 )
 
 
 @pytest.mark.parametrize("method", ["fbp", "pwls"])
 def test_readings_that_are_lost_for_a_while_are_counted_and_harmless(method, lines):
-    """One cell, dead for a third of the turn, of thousands of counts: 40 times the noise once, and a white arc."""
+    """One cell, dead for a third of the turn, of thousands of counts: 40 times the noise once,
+    and a white arc."""
     g = GEOMETRIES["fan"]
     n = np.random.default_rng(2).poisson(2e4 * np.exp(-lines["fan"])).astype(float)
     broken = n.copy()
     broken[20:50, 27] = 0.0
-    volumes = [reconstruct(Scan.from_counts(v, g, air=2e4, mu_water=MU), grid_of(g), method) for v in (n, broken)]
+    volumes = [
+        reconstruct(Scan.from_counts(v, g, air=2e4, mu_water=MU), grid_of(g), method)
+        for v in (n, broken)
+    ]
     assert [v.report["dead_readings"] for v in volumes] == [0, 30]
     first, *others = volumes[1].report["warnings"]
     assert first.startswith("1 cells that were dead for part of the views")
     assert len(others) == len(volumes[0].report["warnings"])
-    assert float((volumes[1].data - volumes[0].data).std()) < 0.5 * float(volumes[0].data[8:16, 8:16].std())
+    assert float((volumes[1].data - volumes[0].data).std()) < 0.5 * float(
+        volumes[0].data[8:16, 8:16].std()
+    )

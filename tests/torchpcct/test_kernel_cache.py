@@ -48,7 +48,9 @@ RUN = """
 
 
 def run(folder):
-    value, hits = run_python(textwrap.dedent(RUN), folder, NUMBA_CACHE_DIR=str(folder / "cache")).stdout.split()
+    value, hits = run_python(
+        textwrap.dedent(RUN), folder, NUMBA_CACHE_DIR=str(folder / "cache")
+    ).stdout.split()
     return int(value), int(hits)
 
 
@@ -60,24 +62,29 @@ def edit(path, text, age):
 
 @pytest.mark.extended
 @pytest.mark.parametrize(
-    ("call", "second"), [("forget_outdated(__name__)", 202), pytest.param("", 4, marks=pytest.mark.slow)]
+    ("call", "second"),
+    [("forget_outdated(__name__)", 202), pytest.param("", 4, marks=pytest.mark.slow)],
 )
 def test_an_edited_function_reaches_the_kernels_that_call_it(tmp_path, call, second):
-    """Without the call numba gives the old result: if that ends, the module is of no use any more."""
+    """Without the call numba gives the old result: if that ends, the module is of no use any
+    more."""
     edit(tmp_path / "helper.py", HELPER.format(1), age=-100)
     edit(tmp_path / "kernel.py", KERNEL.format(call), age=-100)
     assert run(tmp_path) == (4, 0)
     assert run(tmp_path) == (4, 1)  # kept
     edit(tmp_path / "helper.py", HELPER.format(100), age=0)
     assert run(tmp_path)[0] == second
-    edit(tmp_path / "helper.py", HELPER.format(1000), age=3600)  # a wrong clock: no process compiles again and again
+    # a wrong clock: no process compiles again and again
+    edit(tmp_path / "helper.py", HELPER.format(1000), age=3600)
     assert run(tmp_path) == (second, 1)
 
 
 def modules():
     for package in (torchpcct, recon, train):
         for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            source = Path(found.module_finder.path, *found.name.rpartition(".")[2:]).with_suffix(".py")
+            source = Path(found.module_finder.path, *found.name.rpartition(".")[2:]).with_suffix(
+                ".py"
+            )
             if source.exists() and "cache=True" in source.read_text(encoding="utf-8"):
                 yield found.name, source.read_text(encoding="utf-8")
 
@@ -87,7 +94,9 @@ def test_every_module_whose_kernels_hold_others_forgets_outdated_ones():
     assert "torchpcct.projector.cpu.cone_kernels" in seen
     for name in seen:
         importlib.import_module(name)
-    missing = [n for n, text in seen.items() if sources(n) and "\nforget_outdated(__name__" not in text]
+    missing = [
+        n for n, text in seen.items() if sources(n) and "\nforget_outdated(__name__" not in text
+    ]
     assert not missing
     held = {p.name for p in sources("torchpcct.projector.cpu.plane_kernels")}
     assert {"cone_kernels.py", "simd.py", "simd_interpolation.py"} <= held
@@ -119,7 +128,8 @@ def test_a_fresh_process_and_later_ones(tmp_path):
 
 @pytest.fixture
 def kernels(tmp_path, monkeypatch):
-    """Two new kernels, kept in a cache of their own; locks in a cache folder of a user of their own."""
+    """Two new kernels, kept in a cache of their own; locks in a cache folder of a user of their
+    own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
     (tmp_path / "made_up_kernels.py").write_text(
         "from numba import njit\n"
@@ -172,7 +182,8 @@ def test_nobody_waits_longer_than_he_has_patience_and_only_for_the_same_kernel(k
     try:
         start = time.monotonic()
         with compiled_once(patience_s=0.3):
-            assert kernels.outer(1.5) == 5.0  # another signature: not in the cache, and both locks are taken
+            # another signature: not in the cache, and both locks are taken
+            assert kernels.outer(1.5) == 5.0
         assert 0.3 <= time.monotonic() - start < 20.0
         fresh = importlib.reload(kernels)
         with compiled_once(patience_s=300.0):
@@ -230,8 +241,12 @@ def test_where_nothing_can_be_kept_a_temporary_folder_is(tmp_path):
         "os.access = lambda *_: False; k._writable = lambda _: False; k.ensure_cache(); "
         "f = Path(os.environ['NUMBA_CACHE_DIR']); print(f.is_dir() and k.is_temporary(f), f)"
     )
-    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | {"TMPDIR": str(tmp_path)}
-    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | {
+        "TMPDIR": str(tmp_path)
+    }
+    run = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
     kept, folder = run.stdout.split()
     assert kept == "True"
     assert not Path(folder).exists()  # gone with the process

@@ -1,4 +1,5 @@
-"""What once gave a wrong result without a word: each is refused, warned of, or right (scenes, scans, operators)."""
+"""What once gave a wrong result without a word: each is refused, warned of, or right (scenes,
+scans, operators)."""
 
 import math
 import warnings
@@ -44,7 +45,8 @@ def test_view_step_by_hand():
 
 @pytest.mark.parametrize("tolerance", [math.nan, -1.0, math.inf, -math.inf])
 def test_a_tolerance_that_compares_with_nothing_is_refused(tolerance):
-    """NaN compares false with every cost, so that all effects were left out; a negative one kept all."""
+    """NaN compares false with every cost, so that all effects were left out; a negative one kept
+    all."""
     for call in (plan, acquire):
         with pytest.raises(ValueError, match="tolerance_hu must be"):
             call(SCENE, scanner(views=12, rows=2), tolerance_hu=tolerance)
@@ -63,7 +65,10 @@ def test_members_of_a_scan_are_checked(clean):
         ("air readings", lambda: replace(s, air=s.air * 0)),
         ("air readings must be finite", lambda: replace(s, air=s.air * math.inf)),
         ("air readings must be finite", lambda: replace(s, air=s.air * math.nan)),
-        ("surround readings must be finite and greater than 0", lambda: replace(s, surround=s.surround * 0)),
+        (
+            "surround readings must be finite and greater than 0",
+            lambda: replace(s, surround=s.surround * 0),
+        ),
         ("surround readings", lambda: replace(s, surround=s.surround * math.nan)),
         ("surround readings", lambda: replace(s, surround=-s.surround)),
         ("counts must be a floating point tensor", lambda: replace(s, counts=s.counts.numpy())),
@@ -89,7 +94,8 @@ def test_a_window_beyond_the_water_correction_is_refused():
 
 
 @pytest.mark.parametrize(
-    "degrees", [np.arange(360.0), np.arange(180.0), np.arange(720) / 2, np.arange(1968) * 360 / 1968]
+    "degrees",
+    [np.arange(360.0), np.arange(180.0), np.arange(720) / 2, np.arange(1968) * 360 / 1968],
 )
 def test_degrees_for_radians_are_noticed(degrees):
     with pytest.warns(UserWarning, match="look like degrees"):
@@ -101,7 +107,8 @@ def test_degrees_for_radians_are_noticed(degrees):
 
 
 def test_a_windowed_projection_equals_the_whole_one():
-    """Whatever else is read: the depth layers of the cone beam must not depend on the rows that are kept."""
+    """Whatever else is read: the depth layers of the cone beam must not depend on the rows that
+    are kept."""
     g = ConeBeam(full_turn(12), 400.0, 700.0, 60, 40, (2.0, 2.0), detector="curved")
     grid = VolumeGrid((20, 24, 22), (1.9, 2.0, 2.1), (1.0, 4.0, -6.0))
     x = torch.rand(grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
@@ -113,8 +120,9 @@ def test_a_windowed_projection_equals_the_whole_one():
 
 @pytest.mark.parametrize("detector", ["flat", "curved"])
 def test_the_row_offset_moves_the_rows_up(detector):
-    """Literal numbers: sod 500, sdd 1000, nine rows of 2 mm moved up by 6 mm. A voxel at z = 4 mm on the axis is seen
-    at 8 mm, by row 5; with the offset's sign turned it would be seen by none."""
+    """Literal numbers: sod 500, sdd 1000, nine rows of 2 mm moved up by 6 mm. A voxel at z = 4 mm
+    on the axis is seen at 8 mm, by row 5; with the offset's sign turned it would be seen by none.
+    """
     g = ConeBeam([0.0, 1.0], 500.0, 1000.0, 5, 9, 2.0, (6.0, 0.0), detector)
     np.testing.assert_allclose(g.row_positions, [-2, 0, 2, 4, 6, 8, 10, 12, 14])
     grid = VolumeGrid((1, 1, 1), (0.5, 0.5, 0.5), (4.0, 0.0, 0.0))

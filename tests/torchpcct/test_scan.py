@@ -11,7 +11,16 @@ from refusals import refused
 import torchpcct
 from recon import reconstruct
 from recon.analytic.inset import InsetFbp
-from torchpcct import ConeBeam, FanBeam, Scan, VectorGeometry, Volume, VolumeGrid, acquire, full_turn
+from torchpcct import (
+    ConeBeam,
+    FanBeam,
+    Scan,
+    VectorGeometry,
+    Volume,
+    VolumeGrid,
+    acquire,
+    full_turn,
+)
 from torchpcct.files import seal
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene
@@ -40,7 +49,17 @@ def whole():
 
 def same_scan(a, b):
     tensors = ("counts", "air", "surround", "quantum", "dead")
-    plain = ("geometry", "window", "exposure_s", "seed", "counting", "logged", "unit", "info", "electronic_noise")
+    plain = (
+        "geometry",
+        "window",
+        "exposure_s",
+        "seed",
+        "counting",
+        "logged",
+        "unit",
+        "info",
+        "electronic_noise",
+    )
     return (
         all(
             (x is None) == (y is None) and (x is None or (x.dtype == y.dtype and torch.equal(x, y)))
@@ -54,24 +73,34 @@ def same_scan(a, b):
     )
 
 
-CONE, FAN = ConeBeam(full_turn(12), 150.0, 250.0, 14, 6, 1.3), FanBeam(full_turn(8), 150.0, 250.0, 12, 2.0)
+CONE = ConeBeam(full_turn(12), 150.0, 250.0, 14, 6, 1.3)
+FAN = FanBeam(full_turn(8), 150.0, 250.0, 12, 2.0)
 SCANS = {
     "windowed": lambda clean: clean,
     "noisy": lambda clean: clean.with_noise(0.35, 7),
     "whole": lambda clean: acquire(SCENE, presets.pcct(views=4, rows=2), duty=0.03, sub_rays=16),
-    "energy-integrating": lambda clean: acquire(SCENE, presets.eid(views=4, rows=2), exposure_s=0.35, sub_rays=16),
-    "line integrals": lambda clean: Scan.from_line_integrals(np.full(FAN.shape, 0.3), FAN, photons=1e5, mu_water=0.02),
+    "energy-integrating": lambda clean: acquire(
+        SCENE, presets.eid(views=4, rows=2), exposure_s=0.35, sub_rays=16
+    ),
+    "line integrals": lambda clean: Scan.from_line_integrals(
+        np.full(FAN.shape, 0.3), FAN, photons=1e5, mu_water=0.02
+    ),
     "view by view": lambda clean: Scan.from_counts(
-        np.full(CONE.shape, 7.0), VectorGeometry.of(CONE).turned(0.05, 0.07).shifted(0.25, 0.5), air=9.0,
+        np.full(CONE.shape, 7.0),
+        VectorGeometry.of(CONE).turned(0.05, 0.07).shifted(0.25, 0.5),
+        air=9.0,
         dead=np.arange(14) == 3,
     ),
-    "a plane view by view": lambda clean: Scan.from_line_integrals(np.full(FAN.shape, 0.3), VectorGeometry.of(FAN)),
-}  # fmt: skip
+    "a plane view by view": lambda clean: Scan.from_line_integrals(
+        np.full(FAN.shape, 0.3), VectorGeometry.of(FAN)
+    ),
+}
 
 
 @pytest.mark.parametrize("kind", SCANS)
 def test_files_keep_every_scan(tmp_path, clean, kind):
-    """What was saved comes back to the bit, and so does what is made of it; files are plain HDF5 for others."""
+    """What was saved comes back to the bit, and so does what is made of it; files are plain HDF5
+    for others."""
     scan = SCANS[kind](clean)
     scan.save(tmp_path / "scan.h5")
     back = Scan.load(tmp_path / "scan.h5")
@@ -121,7 +150,9 @@ def test_the_logarithm_of_counts_is_finite_and_unbiased(clean):
     truth = float((flat._at_window(flat.air.log()) - np.log(20.0)).double().mean())
     noisy = flat.with_noise(1.0, 0)
     measured = noisy.line_integrals().double()
-    standard_error = float(measured.sub(noisy._at_window(noisy.air.log())).std()) / np.sqrt(measured.numel())
+    standard_error = float(measured.sub(noisy._at_window(noisy.air.log())).std()) / np.sqrt(
+        measured.numel()
+    )
     assert abs(float(measured.mean()) - truth) < 1e-4 + 1 / (24 * 400) + 4 * standard_error
     starved = flat.with_noise(1e-3, 0)
     assert (starved.counts == 0).float().mean() > 0.9
@@ -137,12 +168,15 @@ def test_inset_from_the_window_equals_the_fbp_of_whole_rows(clean, whole):
 
 
 def test_noise_beyond_the_window_does_not_matter(clean, whole):
-    """Noise is drawn around the inset's footprint only: the inset's noise is the same to a few per mille."""
+    """Noise is drawn around the inset's footprint only: the inset's noise is the same to a few
+    per mille."""
     noise_a = (
-        InsetFbp(clean, [INSET], ["soft"])(clean.with_noise(2.0, 3))[0] - InsetFbp(clean, [INSET], ["soft"])(clean)[0]
+        InsetFbp(clean, [INSET], ["soft"])(clean.with_noise(2.0, 3))[0]
+        - InsetFbp(clean, [INSET], ["soft"])(clean)[0]
     )
     noise_b = (
-        InsetFbp(whole, [INSET], ["soft"])(whole.with_noise(2.0, 3))[0] - InsetFbp(whole, [INSET], ["soft"])(whole)[0]
+        InsetFbp(whole, [INSET], ["soft"])(whole.with_noise(2.0, 3))[0]
+        - InsetFbp(whole, [INSET], ["soft"])(whole)[0]
     )
     assert float((noise_a - noise_b).square().mean() / noise_b.square().mean()) < 2e-3
 
@@ -150,24 +184,32 @@ def test_noise_beyond_the_window_does_not_matter(clean, whole):
 def test_refusals_of_reconstruct(clean):
     refused(
         ("kernel", lambda: reconstruct(clean, INSET, "fbp", kernel="hard")),
-        (r"field of view|region", lambda: reconstruct(clean, VolumeGrid((4, 4, 4), 0.2, (0, 0, 400.0)), "fbp")),
+        (
+            r"field of view|region",
+            lambda: reconstruct(clean, VolumeGrid((4, 4, 4), 0.2, (0, 0, 400.0)), "fbp"),
+        ),
         ("region", lambda: reconstruct(clean, VolumeGrid((4, 4, 4), 0.2, (0, 0, 60.0)), "fbp")),
         ("too few photons", lambda: reconstruct(clean.with_noise(1e-5, 0), INSET, "fbp")),
     )
 
 
 def test_a_lower_dose_of_a_measured_scan(clean):
-    """As noisy as a scan that was simulated at that dose, cell by cell of many realisations; all bins by themselves."""
+    """As noisy as a scan that was simulated at that dose, cell by cell of many realisations; all
+    bins by themselves."""
     high = [clean.with_noise(2.0, k).at_dose(0.25, k) for k in range(24)]
     low = [clean.with_noise(0.5, 100 + k) for k in range(24)]
     assert high[0].exposure_s == pytest.approx(0.5)
     torch.testing.assert_close(high[0].air, low[0].air)
     torch.testing.assert_close(high[0].surround, low[0].surround)
     assert high[0].info["lower_dose"] == {"fraction": 0.25, "seed": 0, "exact": True}
-    variance = [torch.stack([s.line_integrals() for s in scans]).var(0).mean() for scans in (high, low)]
+    variance = [
+        torch.stack([s.line_integrals() for s in scans]).var(0).mean() for scans in (high, low)
+    ]
     n = clean.counts.numel() * 23
     assert float(variance[0] / variance[1]) == pytest.approx(1.0, abs=4.5 * (4 / n) ** 0.5 + 0.002)
-    mean = torch.stack([s.counts for s in high]).mean() / torch.stack([s.counts for s in low]).mean()
+    mean = (
+        torch.stack([s.counts for s in high]).mean() / torch.stack([s.counts for s in low]).mean()
+    )
     assert float(mean) == pytest.approx(1.0, abs=4.5 * float(2 / low[0].counts.sum() / 24) ** 0.5)
 
 

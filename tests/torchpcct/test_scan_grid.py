@@ -1,4 +1,5 @@
-"""The grid of what a scan sees: regions, windows of which nothing else is known, whole detectors."""
+"""The grid of what a scan sees: regions, windows of which nothing else is known, whole
+detectors."""
 
 import re
 from dataclasses import replace
@@ -73,7 +74,10 @@ def test_the_box_that_a_window_sees_lies_within_it(detector, arc):
         region = VolumeGrid((1, 1, 1), (4.0, *draw.uniform(10, 20, 2)), place)
         exact = footprint(geometry, region, margin=1)
         first = np.maximum(exact.first_column - draw.integers(0, 9, 40), 0)
-        for window in (exact, DetectorWindow(first, exact.columns + 12, exact.first_row, exact.rows)):
+        for window in (
+            exact,
+            DetectorWindow(first, exact.columns + 12, exact.first_row, exact.rows),
+        ):
             scan = _windowed(geometry, window)
             box = grid_of(scan)
             assert window.holds(footprint(geometry, box, margin=1))
@@ -95,18 +99,23 @@ def test_a_window_that_sees_no_box_asks_for_one():
 
 
 def test_whole_detectors_give_their_field_of_view():
-    flat = Scan.from_line_integrals(np.full((3, 12, 20), 0.1), ParallelBeam(np.arange(12) * np.pi / 12, 20, 0.5))
+    flat = Scan.from_line_integrals(
+        np.full((3, 12, 20), 0.1), ParallelBeam(np.arange(12) * np.pi / 12, 20, 0.5)
+    )
     assert VolumeGrid.of(flat) == VolumeGrid((3, 19, 19), 0.5)
     assert VolumeGrid.of(flat, voxel=1.0, extent=(4, 6)) == VolumeGrid((3, 4, 6), 1.0)
     one = replace(flat, **flat.each(lambda v: v[0]), air=flat.air[0])
     assert VolumeGrid.of(one, center=(1, 2)) == VolumeGrid((19, 19), 0.5, (1, 2))
     fan = FanBeam(full_turn(12), 100.0, 200.0, 20, 1.0)
     radius = 100 * np.sin(np.arctan(9.5 / 200))
-    assert VolumeGrid.of(Scan.from_line_integrals(np.full((12, 20), 0.1), fan)).extent[0] == pytest.approx(
-        2 * radius, abs=0.5
+    assert VolumeGrid.of(Scan.from_line_integrals(np.full((12, 20), 0.1), fan)).extent[
+        0
+    ] == pytest.approx(2 * radius, abs=0.5)
+    cone = Scan.from_line_integrals(
+        np.full((12, 8, 20), 0.1), ConeBeam(full_turn(12), 100.0, 200.0, 20, 8, 1.0)
     )
-    cone = Scan.from_line_integrals(np.full((12, 8, 20), 0.1), ConeBeam(full_turn(12), 100.0, 200.0, 20, 8, 1.0))
-    assert VolumeGrid.of(cone) == VolumeGrid((7, 19, 19), 0.5)  # 8 rows of 0.5 mm at the axis, less towards the source
+    # 8 rows of 0.5 mm at the axis, less towards the source
+    assert VolumeGrid.of(cone) == VolumeGrid((7, 19, 19), 0.5)
 
 
 @pytest.mark.parametrize(
@@ -126,7 +135,9 @@ def test_values_that_make_no_grid_are_refused(clean, asked, message):
 
 
 def test_only_a_part_of_a_detector_has_a_region(clean):
-    whole = Scan.from_counts(np.ones((8, 4, 6), np.float32), ConeBeam(full_turn(8), 60.0, 100.0, 6, 4, 1.0), air=2.0)
+    whole = Scan.from_counts(
+        np.ones((8, 4, 6), np.float32), ConeBeam(full_turn(8), 60.0, 100.0, 6, 4, 1.0), air=2.0
+    )
     for scan, region in ((whole, GRID), (clean, GRID.slice)):
         with pytest.raises(ValueError, match="region must be"):
             replace(scan, region=region)

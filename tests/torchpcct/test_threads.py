@@ -1,4 +1,5 @@
-"""Sharing of kernels among threads: every index once, whoever calls and whatever goes wrong (forks: test_operator)."""
+"""Sharing of kernels among threads: every index once, whoever calls and whatever goes wrong
+(forks: test_operator)."""
 
 import gc
 import threading
@@ -51,7 +52,9 @@ def test_threads_take_part_and_pieces_are_as_large_as_asked(number):
 
 def test_little_work_stays_here():
     seen = []
-    threads.run(lambda begin, end: seen.append((begin, end, threading.get_ident())), 99, operations=1000)
+    threads.run(
+        lambda begin, end: seen.append((begin, end, threading.get_ident())), 99, operations=1000
+    )
     assert seen == [(0, 99, threading.get_ident())]
 
 
@@ -108,7 +111,9 @@ def test_helpers_are_no_more_than_asked_for_and_keep_nothing(number):
     gc.collect()
     assert gone() is None
     ready = time.monotonic() + 30  # those of the tests before end late
-    while (count := sum(t.name.startswith("torchpcct") for t in threading.enumerate())) > number - 1:
+    while (
+        count := sum(t.name.startswith("torchpcct") for t in threading.enumerate())
+    ) > number - 1:
         assert time.monotonic() < ready, count
         time.sleep(0.001)
 

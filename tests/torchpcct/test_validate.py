@@ -1,4 +1,5 @@
-"""Checks of arguments: clean values pass, the rest is refused by name, with the reason and the unit."""
+"""Checks of arguments: clean values pass, the rest is refused by name, with the reason and the
+unit."""
 
 import math
 
@@ -24,14 +25,26 @@ def test_clean_values_pass():
 @pytest.mark.parametrize(
     ("check", "error", "message"),
     [
-        (lambda: number("x", "two", unit="mm"), TypeError, r"x must be a number in mm, got 'two' \(str\)"),
+        (
+            lambda: number("x", "two", unit="mm"),
+            TypeError,
+            r"x must be a number in mm, got 'two' \(str\)",
+        ),
         (lambda: number("x", 1j), TypeError, "x must be a real number"),
         (lambda: number("x", None), TypeError, "got None"),
         (lambda: number("x", math.inf), ValueError, "x must be finite, got inf"),
         (lambda: number("x", math.nan, finite=False), ValueError, "x must be a number, got nan"),
-        (lambda: number("x", 0, positive=True, unit="s"), ValueError, "x must be greater than 0 s, got 0"),
+        (
+            lambda: number("x", 0, positive=True, unit="s"),
+            ValueError,
+            "x must be greater than 0 s, got 0",
+        ),
         (lambda: number("x", 3, low=0, high=1), ValueError, r"x must lie in \[0, 1\], got 3"),
-        (lambda: number("x", -1, low=0, unit="keV"), ValueError, "x must be at least 0 keV, got -1"),
+        (
+            lambda: number("x", -1, low=0, unit="keV"),
+            ValueError,
+            "x must be at least 0 keV, got -1",
+        ),
         (lambda: number("x", 2, high=1), ValueError, "x must be at most 1, got 2"),
         (lambda: numbers("x", (1.0, math.nan)), ValueError, r"x\[1\] must be finite"),
         (lambda: numbers("x", (1.0, 2.0), 3), ValueError, "x must be 3 numbers"),

@@ -1,4 +1,5 @@
-"""The page that shows volumes in a browser: what it holds, and, where Playwright and a Chromium are, what it does."""
+"""The page that shows volumes in a browser: what it holds, and, where Playwright and a Chromium
+are, what it does."""
 
 import base64
 import json
@@ -19,17 +20,35 @@ def _volumes():
     fine = 300 * torch.randn(7, 12, 10, generator=draw)
     coarse = 40 * torch.randn(3, 5, 4, generator=draw)
     return (
-        ("fine <b>", Volume(fine, VolumeGrid((7, 12, 10), (1.0, 0.5, 0.5), (2.0, -30.0, 10.0))), 0.0, 900.0),
-        ("coarse", Volume(coarse, VolumeGrid((3, 5, 4), (2.0, 1.25, 1.5), (2.5, -30.5, 10.0))), 0.0, 200.0),
+        (
+            "fine <b>",
+            Volume(fine, VolumeGrid((7, 12, 10), (1.0, 0.5, 0.5), (2.0, -30.0, 10.0))),
+            0.0,
+            900.0,
+        ),
+        (
+            "coarse",
+            Volume(coarse, VolumeGrid((3, 5, 4), (2.0, 1.25, 1.5), (2.5, -30.5, 10.0))),
+            0.0,
+            200.0,
+        ),
     )
 
 
 def _decoded(page):
     """Values of the volumes of a page, and what it says of them."""
-    about = json.loads(re.search(r'<script id="volumes" type="application/json">(.*?)</script>', page)[1])
+    about = json.loads(
+        re.search(r'<script id="volumes" type="application/json">(.*?)</script>', page)[1]
+    )
     for number, volume in enumerate(about):
-        coded = re.search(rf'<script id="data{number}" type="text/plain">(.*?)</script>', page, re.DOTALL)[1]
-        low, high = np.frombuffer(zlib.decompress(base64.b64decode(coded)), np.uint8).astype(int).reshape(2, -1)
+        coded = re.search(
+            rf'<script id="data{number}" type="text/plain">(.*?)</script>', page, re.DOTALL
+        )[1]
+        low, high = (
+            np.frombuffer(zlib.decompress(base64.b64decode(coded)), np.uint8)
+            .astype(int)
+            .reshape(2, -1)
+        )
         codes = (low + 256 * high).reshape(volume["shape"])
         yield volume, np.where(codes == 65535, np.nan, volume["low"] + volume["step"] * codes)
 
@@ -43,7 +62,12 @@ def test_a_page_holds_the_volumes_and_no_address():
     assert "<b>" not in page
     for (label, volume, level, width), (about, values) in zip(volumes, _decoded(page), strict=True):
         np.testing.assert_allclose(values, volume.data, atol=0.0501)
-        assert (about["label"], about["level"], about["width"], about["unit"]) == (label, level, width, "HU")
+        assert (about["label"], about["level"], about["width"], about["unit"]) == (
+            label,
+            level,
+            width,
+            "HU",
+        )
         assert about["spacing"] == list(volume.grid.spacing)
         assert about["center"] == list(volume.grid.center)
 
@@ -52,7 +76,11 @@ def test_letters_say_where_right_and_front_are():
     """As every other format has them: x to the right, y to the front, z to the head."""
     page = viewer_page(_volumes(), "v")
     assert 'const ENDS = [["I", "S"], ["P", "A"], ["L", "R"]];' in page  # of z, y, x
-    for plane in ('"axial", across: 2, up: 1', '"coronal", across: 2, up: 0', '"sagittal", across: 1, up: 0'):
+    for plane in (
+        '"axial", across: 2, up: 1',
+        '"coronal", across: 2, up: 0',
+        '"sagittal", across: 1, up: 0',
+    ):
         assert plane in page
     assert page.count("letters(p, c)") == 2
 
@@ -62,7 +90,9 @@ def test_any_range_of_values_is_kept_to_its_ten_thousandths(scale):
     data = scale * torch.linspace(-0.3, 1.0, 24).reshape(2, 3, 4)
     data[0, 0, 1], data[1, 1, 1] = torch.nan, torch.inf
     for unit in ("HU", "mm^-1"):
-        page = viewer_page([("v", Volume(data, VolumeGrid((2, 3, 4), 1.0), unit=unit), 0.0, 1.0)], "v")
+        page = viewer_page(
+            [("v", Volume(data, VolumeGrid((2, 3, 4), 1.0), unit=unit), 0.0, 1.0)], "v"
+        )
         (_, values), *_ = _decoded(page)
         assert np.isnan(values).sum() == 2
         off = max(2e-4 * scale, 0.0501 if unit == "HU" else 0.0)
@@ -95,7 +125,9 @@ def page(tmp_path):
     playwright = pytest.importorskip("playwright.sync_api")
     (tmp_path / "view.html").write_text(viewer_page(_volumes(), "test"), encoding="utf-8")
     with playwright.sync_playwright() as started:
-        own = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+        own = next(
+            filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+        )
         try:
             browser = started.chromium.launch(executable_path=own, args=["--no-sandbox"])
         except playwright.Error as error:
@@ -138,7 +170,8 @@ def test_the_page_does_what_it_says(page):
         return box["x"] + across * box["width"], box["y"] + down * box["height"]
 
     ends = [canvas.get_attribute("data-ends") for canvas in page.locator("canvas").all()]
-    assert ends == ["L R A P", "L R S I", "P A S I"] * 2  # left, right, top, bottom of axial, coronal, sagittal
+    # left, right, top, bottom of axial, coronal, sagittal
+    assert ends == ["L R A P", "L R S I", "P A S I"] * 2
     # Values under the pointer, of both volumes, on different grids.
     checked = 0
     for across, down in ((0.23, 0.31), (0.47, 0.52), (0.81, 0.33), (0.37, 0.77), (0.02, 0.02)):
@@ -149,7 +182,9 @@ def test_the_page_does_what_it_says(page):
             if not all(0 <= k < n for k, n in zip(index, volume.grid.shape, strict=True)):
                 assert cells[1] == "–"
                 continue
-            assert float(cells[1].split()[0]) == pytest.approx(float(volume.data[tuple(index)]), abs=0.051)
+            assert float(cells[1].split()[0]) == pytest.approx(
+                float(volume.data[tuple(index)]), abs=0.051
+            )
             checked += 1
             if volume is volumes[0]:  # and so grey is the picture there: window 0 ± 450 HU
                 grey = 255 * min(max(float(volume.data[tuple(index)]) / 900 + 0.5, 0), 1)
@@ -157,7 +192,8 @@ def test_the_page_does_what_it_says(page):
                     page.locator("canvas")
                     .nth(0)
                     .evaluate(
-                        "(canvas, [a, b]) => canvas.getContext('2d').getImageData(a, b, 1, 1).data[0]",
+                        "(canvas, [a, b]) => canvas.getContext('2d').getImageData(a, b, 1, "
+                        "1).data[0]",
                         [int(across * box["width"]), int(down * box["height"])],
                     )
                 )

@@ -8,7 +8,9 @@ from train.config import TrainConfig, differences, load_config, packaged_config
 
 
 def test_round_trip(tmp_path):
-    config = TrainConfig(steps=7, clip=float("inf"), network={"channels": [4, 6, 8]}, learning_rate=1e-5)
+    config = TrainConfig(
+        steps=7, clip=float("inf"), network={"channels": [4, 6, 8]}, learning_rate=1e-5
+    )
     assert TrainConfig.from_yaml(config.to_yaml()).to_yaml() == config.to_yaml()
     assert TrainConfig.from_yaml(config.to_yaml()) == config
     (tmp_path / "c.yaml").write_text(config.to_yaml())

@@ -1,4 +1,5 @@
-"""Batches of the training: reproducible, with the right noise, signal and contrasts, and kept in a file."""
+"""Batches of the training: reproducible, with the right noise, signal and contrasts, and kept in
+a file."""
 
 import errno
 import math
@@ -50,7 +51,9 @@ def test_an_epoch_takes_every_scene_once(data):
     epochs = [[data.numbers(6 * epoch + k, BATCH) for k in range(6)] for epoch in range(2)]
     for epoch in epochs:
         assert sorted(n for numbers in epoch for n in numbers) == list(range(24))
-        assert all(len({n % 2 for n in numbers}) == 1 for numbers in epoch), "one Gram operator in a step"
+        assert all(len({n % 2 for n in numbers}) == 1 for numbers in epoch), (
+            "one Gram operator in a step"
+        )
     assert epochs[0] != epochs[1]
     assert data.batches_in_epoch(5) == 4
 
@@ -71,7 +74,8 @@ def test_two_draws_of_noise_are_independent_of_each_other_and_of_other_scenes(da
 
 
 def test_views_are_those_of_the_method(data):
-    """To the rounding of half precision; the last third is the scene itself, blurred as a scan is."""
+    """To the rounding of half precision; the last third is the scene itself, blurred as a scan
+    is."""
     batch = data.batch(1, BATCH, range(4))
     found = first_views(batch.problem, bilateral=True)
     for kept, made in zip(batch.views, found, strict=True):
@@ -84,12 +88,15 @@ def test_views_are_those_of_the_method(data):
 
 
 def test_contrasts_are_differences_of_means(data):
-    """Weights of a core add up to 1, of its surround to -1, or all are 0; the number of voxels is the smaller one's."""
+    """Weights of a core add up to 1, of its surround to -1, or all are 0; the number of voxels
+    is the smaller one's."""
     seen = 0
     for step in range(12):
         batch = data.batch(step, BATCH, range(4))
         assert batch.contrast.shape == (4, ROIS, *CONFIG.shape)
-        for contrast, voxels in zip(batch.contrast.flatten(0, 1), batch.voxels.flatten(), strict=True):
+        for contrast, voxels in zip(
+            batch.contrast.flatten(0, 1), batch.voxels.flatten(), strict=True
+        ):
             if not float(voxels):
                 assert not contrast.any()
                 continue
@@ -120,7 +127,8 @@ def test_every_orientation_has_its_inverse(number):
 
 @pytest.mark.extended
 def test_views_are_computed_once(data, tmp_path, monkeypatch):
-    """By processes beforehand as when they are used; a later run reads them, also one that shares the folder."""
+    """By processes beforehand as when they are used; a later run reads them, also one that
+    shares the folder."""
     few = replace(CONFIG, scenes_kept=2, situations=CONFIG.situations[:1])
     ahead = Data(few, 3, tmp_path)
     ahead.prepare(1)
@@ -142,7 +150,8 @@ def test_views_are_computed_once(data, tmp_path, monkeypatch):
 
 @pytest.mark.extended
 def test_a_gpu_computes_the_views_that_the_cpu_would(data, tmp_path, monkeypatch):
-    """Processes paint, the device that trains computes, and holds the scenes while there is room."""
+    """Processes paint, the device that trains computes, and holds the scenes while there is
+    room."""
     few = replace(CONFIG, scenes_kept=3, situations=CONFIG.situations[:1])
     free = [90, 90, 10]
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free.pop(0), 100))
@@ -164,7 +173,8 @@ def test_a_gpu_computes_the_views_that_the_cpu_would(data, tmp_path, monkeypatch
 
 def test_folders_of_other_data_are_not_mixed_up(tmp_path):
     folders = {
-        Views(tmp_path, c, seed).folder for c, seed in ((CONFIG, 1), (CONFIG, 2), (replace(CONFIG, views=60), 1))
+        Views(tmp_path, c, seed).folder
+        for c, seed in ((CONFIG, 1), (CONFIG, 2), (replace(CONFIG, views=60), 1))
     }
     assert len(folders) == 3
     path = Views(tmp_path, CONFIG, 1).folder / "truth.npy"

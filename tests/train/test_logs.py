@@ -80,7 +80,14 @@ def test_card(uninterrupted):
     assert card["seed"] == 0
     assert card["sessions"] == [{"command": "python -m train --out whole", "first_step": 0}]
     assert card["versions"]["torch"] == torch.__version__
-    assert set(card["versions"]) >= {"torchpcct", "python", "numpy", "scipy", "numba", "safetensors"}
+    assert set(card["versions"]) >= {
+        "torchpcct",
+        "python",
+        "numpy",
+        "scipy",
+        "numba",
+        "safetensors",
+    }
     assert card["hardware"]["cores"] >= 1
     assert card["hardware"]["cpu"]
     assert card["validation"]["bias"] == "nan"

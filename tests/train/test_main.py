@@ -40,15 +40,26 @@ def test_command_line(tmp_path, objective, capsys):
     assert json.loads((out / "card.json").read_text())["config"]["seed"] == 4
     weights = out / "weights.safetensors"
     plain = ["--no-progress", "--no-tensorboard"]
-    assert command_line.main([*start, "--out", str(tmp_path / "y"), "--weights", str(weights), *plain]) == 0
-    assert command_line.main([*start, "--out", str(tmp_path / "z"), "--weights", str(out / "training.md")]) == 2
+    assert (
+        command_line.main([*start, "--out", str(tmp_path / "y"), "--weights", str(weights), *plain])
+        == 0
+    )
+    assert (
+        command_line.main(
+            [*start, "--out", str(tmp_path / "z"), "--weights", str(out / "training.md")]
+        )
+        == 2
+    )
     assert "training.md is damaged or not a safetensors file" in capsys.readouterr().err
 
 
 def test_second_interrupt_stops_at_once(tmp_path, objective, capsys):
     common = ["--no-progress", "--no-tensorboard"]
     objective.at = {6: send(signal.SIGINT, signal.SIGINT)}
-    assert command_line.main(["--quick", "--steps", "12", "--out", str(tmp_path / "x"), *common]) == 130
+    assert (
+        command_line.main(["--quick", "--steps", "12", "--out", str(tmp_path / "x"), *common])
+        == 130
+    )
     assert "stopped at once" in capsys.readouterr().err
     objective.at = {}
     assert command_line.main(["--resume", "--out", str(tmp_path / "x"), *common]) == 0
@@ -70,7 +81,9 @@ def test_refusals(tmp_path, objective, capsys):
         assert command_line.main(words) == 2
         assert capsys.readouterr().err == f"torchpcct train: {message}\n"
     (tmp_path / "c.yaml").write_text("stepps: 1")
-    assert command_line.main(["--config", str(tmp_path / "c.yaml"), "--out", str(tmp_path / "o")]) == 2
+    assert (
+        command_line.main(["--config", str(tmp_path / "c.yaml"), "--out", str(tmp_path / "o")]) == 2
+    )
     assert "c.yaml: unknown key 'stepps'" in capsys.readouterr().err
     assert command_line.main(["--config", str(tmp_path / "none.yaml")]) == 2
     assert command_line.main(["--resume", "--out", str(tmp_path / "none")]) == 2
@@ -85,7 +98,8 @@ def test_nothing_heavy_is_loaded_before_the_numbers_of_threads_are_set():
 def test_a_wider_network_starts_where_the_narrower_one_stood():
     torch.manual_seed(0)
     narrow, wide = (
-        Unrolled(NetworkConfig(channels, 0.2, 1.6, bilateral=True), 1) for channels in ((4, 6, 8), (8, 9, 8))
+        Unrolled(NetworkConfig(channels, 0.2, 1.6, bilateral=True), 1)
+        for channels in ((4, 6, 8), (8, 9, 8))
     )
     with torch.no_grad():
         narrow.network.share.fill_(0.3)

@@ -13,7 +13,9 @@ from train.config import DataConfig, ObjectiveConfig, Situation
 from train.data import Data, _edges
 from train.objective import Objective
 
-CONFIG = DataConfig(shape=(20, 16, 16), voxel_mm=0.4, views=120, scenes_kept=40, situations=(Situation(42.0, 0.0),))
+CONFIG = DataConfig(
+    shape=(20, 16, 16), voxel_mm=0.4, views=120, scenes_kept=40, situations=(Situation(42.0, 0.0),)
+)
 
 
 class Given(nn.Module):
@@ -37,11 +39,15 @@ def data(tmp_path_factory):
 
 
 def truth_of(batch):
-    return torch.cat([batch.truth, batch.truth]) / batch.problem.scale_hu[: 2 * batch.size].reshape(-1, 1, 1, 1)
+    return torch.cat([batch.truth, batch.truth]) / batch.problem.scale_hu[: 2 * batch.size].reshape(
+        -1, 1, 1, 1
+    )
 
 
 def with_contrast(data):
-    return next(b for step in range(10) if (b := data.batch(step, 4, range(4))).contrast[:, -1].any())
+    return next(
+        b for step in range(10) if (b := data.batch(step, 4, range(4))).contrast[:, -1].any()
+    )
 
 
 def test_the_truth_has_no_loss(data):
@@ -51,20 +57,24 @@ def test_the_truth_has_no_loss(data):
 
 
 def test_terms_by_their_definitions(data):
-    """A constant error c everywhere: no contrast error, c² (1 + edge in bodies), c² times the mean of H 1."""
+    """A constant error c everywhere: no contrast error, c² (1 + edge in bodies), c² times the
+    mean of H 1."""
     batch = data.batch(0, 4, range(2))
     noisy = batch.problem.part(range(4))
     error = 0.3 * torch.ones_like(noisy.beta)
     parts = Objective(ObjectiveConfig(edge=0.0))(Given(truth_of(batch) + error), batch).parts
     assert parts["white"] == pytest.approx(2 * 0.09, rel=1e-4)
-    assert parts["data"] == pytest.approx(float((error * noisy.apply(error)).mean((1, 2, 3)).sum()) / 2, rel=1e-4)
+    assert parts["data"] == pytest.approx(
+        float((error * noisy.apply(error)).mean((1, 2, 3)).sum()) / 2, rel=1e-4
+    )
     assert parts["contrast"] == pytest.approx(0.0, abs=1e-4)
     more = Objective(ObjectiveConfig(edge=2.0))(Given(truth_of(batch) + error), batch).parts
     assert parts["white"] < more["white"] < 3 * parts["white"]
 
 
 def test_noise_costs_once_and_bias_with_its_weight(data):
-    """Contrast errors that are opposite in both draws are noise: κ d₁ d₂ gives back; equal ones are bias: it adds."""
+    """Contrast errors that are opposite in both draws are noise: κ d₁ d₂ gives back; equal ones
+    are bias: it adds."""
     batch = with_contrast(data)
     roi = batch.contrast[:, -1]
     push = roi / roi.square().sum((1, 2, 3), keepdim=True).clamp_min(1e-6)
@@ -91,7 +101,11 @@ def test_bias_weighs_more_where_one_measures(data):
     push = roi / roi.square().sum((1, 2, 3), keepdim=True).clamp_min(1e-6)
     given = Given(truth_of(batch) + 0.01 * torch.cat([push, push]))
     totals = [
-        float(Objective(ObjectiveConfig(bias=(0.0, 4.0), fidelities=(fidelity, fidelity)))(given, batch).total)
+        float(
+            Objective(ObjectiveConfig(bias=(0.0, 4.0), fidelities=(fidelity, fidelity)))(
+                given, batch
+            ).total
+        )
         for fidelity in (0, 1)
     ]
     even = float(Objective(ObjectiveConfig(bias=(0.0, 0.0), fidelities=(1, 1)))(given, batch).total)
@@ -100,7 +114,8 @@ def test_bias_weighs_more_where_one_measures(data):
 
 
 def test_the_scene_without_noise_counts_with_its_weight(data):
-    """Half of the scenes, each for two; there the model sees it behind the two draws, in one call."""
+    """Half of the scenes, each for two; there the model sees it behind the two draws, in one
+    call."""
     batch = data.batch(0, 4, range(2))
     free = []
 
@@ -118,7 +133,8 @@ def test_the_scene_without_noise_counts_with_its_weight(data):
         total = Objective(ObjectiveConfig(contrast=0.0, noise_free=0.5))(model, drawn).total
         added[tuple(free)] = float(total) - float(without.total)
         assert model.sizes[-1] == 4 + len(free)
-    # Two draws and the scene have the same error: with a weight of a half and half of the scenes, once more.
+    # Two draws and the scene have the same error: with a weight of a half and half of the scenes,
+    # once more.
     assert added[()] == pytest.approx(0.0, abs=1e-4)
     assert added[0, 1] == pytest.approx(float(without.total), rel=1e-4)
     assert added[0,] + added[1,] == pytest.approx(added[0, 1], rel=1e-4)
@@ -127,12 +143,18 @@ def test_the_scene_without_noise_counts_with_its_weight(data):
 
 
 def test_the_network_sees_its_views_turned_and_gives_volumes_that_are_not(data):
-    """A network that does what it does in every orientation has the same loss in all of them; another has not."""
+    """A network that does what it does in every orientation has the same loss in all of them;
+    another has not."""
     model = Unrolled(NetworkConfig((4, 4, 4), 0.4, bilateral=True), steps=1).train()
     batch = data.batch(0, 4, range(2))
-    assert sum(torch.equal(data.batch(k, 4, [0]).turned(batch.truth), batch.truth) for k in range(10)) < 5
+    assert (
+        sum(torch.equal(data.batch(k, 4, [0]).turned(batch.truth), batch.truth) for k in range(10))
+        < 5
+    )
     loss = float(Objective()(model, batch).total.detach())
-    model.network.forward = lambda estimate, towards, condition, smoothed: 0.5 * (towards + smoothed)
+    model.network.forward = lambda estimate, towards, condition, smoothed: (
+        0.5 * (towards + smoothed)
+    )
     still = replace(batch, turned=lambda v: v, unturned=lambda v: v)
     one, other = (float(Objective()(model, b).total) for b in (batch, still))
     assert one == pytest.approx(other, rel=1e-5)
@@ -141,10 +163,13 @@ def test_the_network_sees_its_views_turned_and_gives_volumes_that_are_not(data):
 
 @pytest.mark.extended
 def test_validation_is_relative_to_the_filter(data):
-    """The filter in the network's place has ratios of 1; half of its error has half of them, whatever the scene."""
+    """The filter in the network's place has ratios of 1; half of its error has half of them,
+    whatever the scene."""
     held_out = Data(replace(CONFIG, scenes_kept=8), 9, data.views.folder.parent)
     held_out._grams = data._grams
-    assert math.isfinite(Objective().validate(Unrolled(NetworkConfig((4, 4, 4), 0.4)).eval(), held_out).score)
+    assert math.isfinite(
+        Objective().validate(Unrolled(NetworkConfig((4, 4, 4), 0.4)).eval(), held_out).score
+    )
     model = Unrolled(NetworkConfig((4, 4, 4), 0.4, bilateral=True), steps=1).eval()
     with torch.no_grad():
         model.network.leave.weight.zero_()

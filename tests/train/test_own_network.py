@@ -1,4 +1,5 @@
-"""Training a network of a user's own, which the configuration names: the code of the how-to, and what is refused."""
+"""Training a network of a user's own, which the configuration names: the code of the how-to, and
+what is refused."""
 
 import re
 import subprocess
@@ -24,17 +25,22 @@ HOW_TO = Path(__file__).parents[2] / "notebooks" / "docs" / "howto" / "own_prior
 
 def block(title):
     """The code of the how-to that begins with a comment."""
-    (found,) = re.findall(rf"```\w+\n# {re.escape(title)}\n(.*?)```", HOW_TO.read_text(encoding="utf-8"), re.DOTALL)
+    (found,) = re.findall(
+        rf"```\w+\n# {re.escape(title)}\n(.*?)```", HOW_TO.read_text(encoding="utf-8"), re.DOTALL
+    )
     return found
 
 
 @pytest.fixture
 def nets(tmp_path, monkeypatch):
-    """A module of a user's own with the network of the how-to and others; it has not been imported."""
+    """A module of a user's own with the network of the how-to and others; it has not been
+    imported."""
     others = (
-        "\nclass Counting(MyNet):\n    def __init__(self, width=16):\n        super().__init__(width)\n"
+        "\nclass Counting(MyNet):\n    def __init__(self, width=16):\n        "
+        "super().__init__(width)\n"
         "        self.register_buffer('seen', torch.tensor(100_003))\n"
-        "\nclass Filter(nn.Module):\n    def forward(self, estimate, towards, condition, smoothed):\n"
+        "\nclass Filter(nn.Module):\n    def forward(self, estimate, towards, condition, "
+        "smoothed):\n"
         "        return smoothed\n"
         "\nclass Denoiser(nn.Conv3d):\n    def __init__(self):\n        super().__init__(1, 1, 1)\n"
         "    def forward(self, volume, sigma):\n        return volume\n"
@@ -51,7 +57,10 @@ def nets(tmp_path, monkeypatch):
 
 
 def test_a_network_is_named_alone_or_with_its_arguments():
-    alone, mapped = (TrainConfig.from_yaml(f"network: {text}") for text in ("no.such:Net", "{class: no.such:Net}"))
+    alone, mapped = (
+        TrainConfig.from_yaml(f"network: {text}")
+        for text in ("no.such:Net", "{class: no.such:Net}")
+    )
     assert alone == mapped
     assert alone.network == {"class": "no.such:Net"}
     given = TrainConfig.from_yaml("network: {class: no.such:Net.Inner, width: 3, deep: [1, 2]}")
@@ -72,12 +81,24 @@ def test_a_network_is_named_alone_or_with_its_arguments():
     [
         ("no.such:Net", "cannot load 'no.such:Net': No module named"),
         ("NETS:Nothing", "cannot load 'NETS:Nothing'"),
-        ("{class: NETS:MyNet, wide: 3}", "MyNet cannot be made with wide=3: .*unexpected keyword argument 'wide'"),
+        (
+            "{class: NETS:MyNet, wide: 3}",
+            "MyNet cannot be made with wide=3: .*unexpected keyword argument 'wide'",
+        ),
         ("NETS:Filter", "NETS:Filter has no parameters that a training could change"),
-        ("NETS:Denoiser", r"NETS:Denoiser is a denoiser: one to be trained takes \(estimate, towards"),
+        (
+            "NETS:Denoiser",
+            r"NETS:Denoiser is a denoiser: one to be trained takes \(estimate, towards",
+        ),
         ("{class: builtins:dict}", "dict must make a torch.nn.Module"),
-        ("NETS:Channel", r"the prior Channel returned the shape \(2, 1, 40, 32, 32\) for \(2, 40, 32, 32\)"),
-        ("NETS:Other", r"NETS:Other must take \(estimate, .* volumes of \(2, 40, 32, 32\): .*channels"),
+        (
+            "NETS:Channel",
+            r"the prior Channel returned the shape \(2, 1, 40, 32, 32\) for \(2, 40, 32, 32\)",
+        ),
+        (
+            "NETS:Other",
+            r"NETS:Other must take \(estimate, .* volumes of \(2, 40, 32, 32\): .*channels",
+        ),
     ],
 )
 def test_what_cannot_be_trained_is_named(nets, tmp_path, network, text):
@@ -87,8 +108,11 @@ def test_what_cannot_be_trained_is_named(nets, tmp_path, network, text):
 
 
 def test_the_packages_network_starts_as_ever(tmp_path):
-    """``network: {channels: …}`` gives the weights that it always gave, and the precision of the configuration."""
-    config = TrainConfig.from_yaml("{seed: 3, unroll: 1, network: {channels: [4, 4, 4], bilateral: true}}")
+    """``network: {channels: …}`` gives the weights that it always gave, and the precision of the
+    configuration."""
+    config = TrainConfig.from_yaml(
+        "{seed: 3, unroll: 1, network: {channels: [4, 4, 4], bilateral: true}}"
+    )
     model = command_line.build(config, tmp_path / "views")[0]
     torch.manual_seed(3)
     first = nn.Conv3d(24, 4, 3, bias=False).weight
@@ -98,7 +122,8 @@ def test_the_packages_network_starts_as_ever(tmp_path):
 
 
 def test_weights_keep_the_class_and_every_digit(nets, tmp_path):
-    """Other networks may hold counts and values beyond float16; the voxels are those of the training's data."""
+    """Other networks may hold counts and values beyond float16; the voxels are those of the
+    training's data."""
     values = {"class": f"{nets}:Counting", "width": 2}
     config = TrainConfig(network=values, unroll=1, data={"voxel_mm": 0.4})
     model = Unrolled(network_of(values, f"{nets}:Counting"), 1, voxel_mm=0.4)
@@ -112,12 +137,14 @@ def test_weights_keep_the_class_and_every_digit(nets, tmp_path):
     assert found.voxel_mm == 0.4
     assert int(found.model.network.seen) == 100_003
     assert found.weights_sha256 == Mbir(model).weights_sha256
-    with pytest.raises(ValueError, match=r"they do not fit MyNet: network\.seen has the shape \(\) in the file"):
+    with pytest.raises(
+        ValueError, match=r"they do not fit MyNet: network\.seen has the shape \(\) in the file"
+    ):
         Mbir.load(path, network=f"{nets}:MyNet")
 
 
 def test_a_checkpoint_alone_imports_nothing(nets, tmp_path, capsys):
-    """--resume without a configuration takes that of the checkpoint: a class in it is imported once it is named."""
+    """--resume takes the checkpoint's configuration: a class in it is imported once named."""
     out = tmp_path / "run"
     out.mkdir()
     config = TrainConfig.from_yaml(f"network: {nets}:MyNet")
@@ -142,7 +169,16 @@ def test_the_network_of_the_how_to_is_trained_from_an_installed_package(tmp_path
         encoding="utf-8",
     )
     site, here = tmp_path / "site", tmp_path / "elsewhere"
-    install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--target"]
+    install = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "-q",
+        "--no-deps",
+        "--no-build-isolation",
+        "--target",
+    ]
     subprocess.run([*install, str(site), str(package)], check=True, capture_output=True)
     here.mkdir()
     text = block("mine.yaml").replace("data: {", "data: {views: 120, shape: [16, 16, 16], ")
@@ -156,7 +192,9 @@ sys.exit(main(sys.argv[1:]))
     words = ["train", "--config", "mine.yaml", "--out", "own", "--no-progress", "--no-tensorboard"]
     done = run_python(code, *words, cwd=here)
     assert "20 steps in" in done.stdout
-    again = run_python(code, "train", "--out", "own", "--resume", "--no-progress", cwd=here, check=False)
+    again = run_python(
+        code, "train", "--out", "own", "--resume", "--no-progress", cwd=here, check=False
+    )
     assert again.returncode == 2
     assert "--config own/config.yaml" in again.stderr
     check = f"""

@@ -35,7 +35,9 @@ def test_gradient_is_that_of_the_mean_loss():
     for sign in (1, -1):
         with torch.no_grad():
             weight.view(-1)[at] += sign * change
-        losses.append(gradient(stub_config(), model, StubData(), StubObjective(), 4, Group())[0]["loss"])
+        losses.append(
+            gradient(stub_config(), model, StubData(), StubObjective(), 4, Group())[0]["loss"]
+        )
         with torch.no_grad():
             weight.view(-1)[at] -= sign * change
     assert float(found[at]) == pytest.approx((losses[0] - losses[1]) / (2 * change), rel=1e-2)
@@ -43,14 +45,18 @@ def test_gradient_is_that_of_the_mean_loss():
 
 
 def launch(out, launcher):
-    """Two processes of ``tiny_training gradients``; torchrun itself imports torch once more, and waits."""
+    """Two processes of ``tiny_training gradients``; torchrun itself imports torch once more, and
+    waits."""
     words = [tiny_training.__file__, "gradients", str(out)]
     if launcher == "torchrun":
         words = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", *words]
         started = [script(*words, stderr=subprocess.PIPE)]
     else:
         store = {"WORLD_SIZE": "2", "STORE": f"file://{out}/rendezvous"}
-        started = [script(*words, stderr=subprocess.PIPE, more={**store, "RANK": str(rank)}) for rank in range(2)]
+        started = [
+            script(*words, stderr=subprocess.PIPE, more={**store, "RANK": str(rank)})
+            for rank in range(2)
+        ]
     try:
         for process in started:
             _, errors = process.communicate(timeout=180)
@@ -66,7 +72,9 @@ def test_two_processes_give_the_gradients_of_one(tmp_path, launcher):
     launch(tmp_path, launcher)
     config, model = stub_config(batch=5), stub_model()
     values, _ = gradient(config, model, StubData(), StubObjective(), 4, Group())
-    (first, meta), (second, meta_second) = (read_tensors(tmp_path / f"rank{r}.safetensors", "gradient") for r in (0, 1))
+    (first, meta), (second, meta_second) = (
+        read_tensors(tmp_path / f"rank{r}.safetensors", "gradient") for r in (0, 1)
+    )
     assert_same_tensors(first, second)
     assert meta == meta_second
     for name, p in model.named_parameters():
@@ -78,14 +86,23 @@ def test_two_processes_give_the_gradients_of_one(tmp_path, launcher):
     a, b = (Store(p).load()[0] for p in (one, tmp_path / "two"))
     for name in a:
         torch.testing.assert_close(a[name], b[name], rtol=2e-3, atol=2e-4)
-    assert [r["step"] for r in rows(tmp_path / "two" / "log.csv")] == [str(n + 1) for n in range(STEPS)]
+    assert [r["step"] for r in rows(tmp_path / "two" / "log.csv")] == [
+        str(n + 1) for n in range(STEPS)
+    ]
     # Resumed, it gives the bits of the uninterrupted run of two processes.
     assert_same_run(tmp_path / "two", tmp_path / "whole")
 
 
 @pytest.mark.slow
 def test_command_line_under_torchrun(tmp_path):
-    torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", tiny_training.__file__, "command"]
+    torchrun = [
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc_per_node=2",
+        tiny_training.__file__,
+        "command",
+    ]
     process = script(*torchrun, str(tmp_path / "x"), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     out, errors = process.communicate(timeout=180)
     assert process.returncode == 0, errors

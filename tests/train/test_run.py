@@ -1,4 +1,5 @@
-"""A run that is interrupted, killed or crashes anywhere and is resumed gives the bits of one that was not."""
+"""A run that is interrupted, killed or crashes anywhere and is resumed gives the bits of one
+that was not."""
 
 import json
 import os
@@ -37,9 +38,12 @@ def test_resumed_run_is_bit_for_bit_the_uninterrupted_one(tmp_path, uninterrupte
     """Interrupted twice: in the middle, and in the step before a validation."""
     before = signal.getsignal(number)
     for step, resume in ((3, False), (8, True)):
-        state, caught = run(tmp_path / "x", objective=StubObjective({step: send(number)}), resume=resume)
+        state, caught = run(
+            tmp_path / "x", objective=StubObjective({step: send(number)}), resume=resume
+        )
         assert caught == number
-        # The signal came during step number `step` (from 0); all processes agree on it in the next one.
+        # The signal came during step number `step` (from 0); all processes agree on it in the next
+        # one.
         assert state.step == step + 2
     assert signal.getsignal(number) is before
     assert run(tmp_path / "x", resume=True)[0].step == STEPS
@@ -81,7 +85,8 @@ class Crash(BaseException):
 
 @pytest.fixture
 def crash_before(monkeypatch):
-    """A function that runs the training, which ends right before the n-th rename onto a name, as if it were killed."""
+    """A function that runs the training, which ends right before the n-th rename onto a name, as
+    if it were killed."""
 
     def crash(out, name, n, resume):
         real, left = os.replace, [n]
@@ -110,9 +115,11 @@ def test_crash_before_the_first_checkpoint(tmp_path, crash_before, name):
 
 
 def test_crash_at_any_write(tmp_path, uninterrupted, crash_before):
-    """One run crashes at every kind of write, one after the other: it always continues to the same result.
+    """One run crashes at every kind of write, one after the other: it always continues to the same
+    result.
 
-    Every file is written aside, flushed and renamed, so what lies on the disk changes in the renames only.
+    Every file is written aside, flushed and renamed, so what lies on the disk changes in the
+    renames only.
     """
     out = tmp_path / "x"
     crash_before(out, "log.csv", 1, resume=False)
@@ -139,7 +146,9 @@ def test_crash_at_any_write(tmp_path, uninterrupted, crash_before):
 
 DAMAGE = {
     "cut": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3]),
-    "flip": lambda path: path.write_bytes((data := path.read_bytes())[:-10] + bytes([data[-10] ^ 1]) + data[-9:]),
+    "flip": lambda path: path.write_bytes(
+        (data := path.read_bytes())[:-10] + bytes([data[-10] ^ 1]) + data[-9:]
+    ),
     "missing": lambda path: path.unlink(),
     "foreign": lambda path: save_file({"model.0.weight": torch.zeros(3)}, path),
     "pickle": lambda path: path.write_bytes(pickle.dumps({"model": [1.0]})),
@@ -162,7 +171,9 @@ def test_damaged_checkpoint_falls_back_to_the_previous_one(tmp_path, uninterrupt
         if path.exists():
             (both / path.name).write_bytes(path.read_bytes())
     spoil(both / store.previous.name)
-    with pytest.raises(TensorFileError, match=r"checkpoint.safetensors .*checkpoint.previous.safetensors "):
+    with pytest.raises(
+        TensorFileError, match=r"checkpoint.safetensors .*checkpoint.previous.safetensors "
+    ):
         run(both, resume=True)
     with caplog.at_level("INFO", logger="train"):
         run(out, resume=True)
@@ -173,14 +184,29 @@ def test_damaged_checkpoint_falls_back_to_the_previous_one(tmp_path, uninterrupt
 def test_resume_refuses_another_configuration_or_model(tmp_path, caplog):
     run(tmp_path / "x", objective=StubObjective({1: send(signal.SIGTERM)}))
     with pytest.raises(ValueError, match=r"learning_rate, objective\.white"):
-        run(tmp_path / "x", stub_config(learning_rate=1.0, objective=ObjectiveConfig(white=0.1)), resume=True)
+        run(
+            tmp_path / "x",
+            stub_config(learning_rate=1.0, objective=ObjectiveConfig(white=0.1)),
+            resume=True,
+        )
     with pytest.raises(TensorFileError, match="another model"):
-        train(stub_config(), nn.Linear(6, 1), StubData(), StubData(), StubObjective(), tmp_path / "x", resume=True)
+        train(
+            stub_config(),
+            nn.Linear(6, 1),
+            StubData(),
+            StubData(),
+            StubObjective(),
+            tmp_path / "x",
+            resume=True,
+        )
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(threads + 1)
         with caplog.at_level("INFO", logger="train"):
-            assert run(tmp_path / "x", stub_config(checkpoint_seconds=3.0), resume=True)[0].step == STEPS
+            assert (
+                run(tmp_path / "x", stub_config(checkpoint_seconds=3.0), resume=True)[0].step
+                == STEPS
+            )
     finally:
         torch.set_num_threads(threads)
     assert f"threads {threads} → {threads + 1}" in caplog.text
@@ -266,10 +292,14 @@ def test_long_gradients_are_shortened(tmp_path):
         out = tmp_path / str(clip)
         run(out, stub_config(steps=1, clip=clip))
         tensors = Store(out).load()[0]
-        moments[clip] = torch.cat([v.flatten() for k, v in tensors.items() if k.endswith(".exp_avg")])
+        moments[clip] = torch.cat(
+            [v.flatten() for k, v in tensors.items() if k.endswith(".exp_avg")]
+        )
     norm = float(rows(out / "log.csv")[0]["grad_norm"])
     assert float(moments[1e-3].norm()) == pytest.approx(0.1 * 1e-3, rel=1e-4)
-    torch.testing.assert_close(moments[1e-3], moments[float("inf")] * (1e-3 / norm), rtol=1e-4, atol=1e-9)
+    torch.testing.assert_close(
+        moments[1e-3], moments[float("inf")] * (1e-3 / norm), rtol=1e-4, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
@@ -284,7 +314,10 @@ def test_steps_that_are_not_finite_are_skipped(tmp_path, bad):
     assert [r["skipped"] for r in table[5:9]] == ["1", "2", "3", "3"]
     assert table[6]["lr"] == table[7]["lr"] == table[8]["lr"] != table[9]["lr"]
     assert json.loads((tmp_path / "x" / "card.json").read_text())["steps_skipped"] == 3
-    run(tmp_path / "y", objective=StubObjective({**spoil, 6: lambda t: send(signal.SIGTERM)(t) * bad}))
+    run(
+        tmp_path / "y",
+        objective=StubObjective({**spoil, 6: lambda t: send(signal.SIGTERM)(t) * bad}),
+    )
     run(tmp_path / "y", resume=True)
     assert_same_run(tmp_path / "x", tmp_path / "y")
 

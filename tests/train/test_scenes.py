@@ -1,4 +1,5 @@
-"""Random training scenes: what they hold, that they are area-averaged and reproducible, and what they must not hold."""
+"""Random training scenes: what they hold, that they are area-averaged and reproducible, and what
+they must not hold."""
 
 import math
 from collections import Counter
@@ -11,7 +12,16 @@ import torch
 from train.scenes.drawing import STEP, curve, draw_scene, vessel_table
 from train.scenes.held_out import held_out_plaques
 from train.scenes.rasterise import rasterise
-from train.scenes.scene import COLUMNS, SceneConfig, Solid, Texture, Tissue, TrainingScene, Vessel, is_paper_family
+from train.scenes.scene import (
+    COLUMNS,
+    SceneConfig,
+    Solid,
+    Texture,
+    Tissue,
+    TrainingScene,
+    Vessel,
+    is_paper_family,
+)
 
 EXTENT = (8.0, 6.4, 6.4)
 SHAPE = (20, 16, 16)
@@ -19,9 +29,16 @@ VOXEL = 0.4
 Z = np.array([0.0, 0.0, 1.0])
 
 
-def tube(direction=Z, bend=0.0, outer=1.5, lumen=0.8, wall=0.0, start=(0.03, 0.02, 0.01), **values) -> Vessel:
+def tube(
+    direction=Z, bend=0.0, outer=1.5, lumen=0.8, wall=0.0, start=(0.03, 0.02, 0.01), **values
+) -> Vessel:
     """A vessel of constant sections; at first without contrast between its parts."""
-    line = curve(np.array(start), direction / np.linalg.norm(direction), np.full((161, 2), bend / math.sqrt(2)), 80)
+    line = curve(
+        np.array(start),
+        direction / np.linalg.norm(direction),
+        np.full((161, 2), bend / math.sqrt(2)),
+        80,
+    )
     table = vessel_table(line, (0.0, 0.0, outer, outer), (0.0, 0.0, lumen, lumen))
     plain = {"wall_hu": 100.0, "fibrous_hu": 100.0, "lumen_hu": 100.0, "diameter": 2 * outer}
     return Vessel(table, 0.0, 0.0, wall, **{**plain, **values})
@@ -29,7 +46,14 @@ def tube(direction=Z, bend=0.0, outer=1.5, lumen=0.8, wall=0.0, start=(0.03, 0.0
 
 def core(**changes) -> Solid:
     base = Solid(
-        Tissue.CORE, 40.0, (0.6, 0.0, 0.0), (0.6, 0.985, 0.985), (Tissue.LAYER,), vessel=0, cap=0.17, contrast=-52.0
+        Tissue.CORE,
+        40.0,
+        (0.6, 0.0, 0.0),
+        (0.6, 0.985, 0.985),
+        (Tissue.LAYER,),
+        vessel=0,
+        cap=0.17,
+        contrast=-52.0,
     )
     return replace(base, **changes)
 
@@ -51,16 +75,35 @@ def test_same_seed_same_scene() -> None:
 def test_what_many_scenes_hold() -> None:
     """Every kind of disease is drawn often enough to be learned, and most cores lie inside."""
     scenes = [draw_scene(seed, EXTENT) for seed in range(400)]
-    kinds = Counter(s.kind for scene in scenes for s in {s.kind: s for s in (*scene.beside, *scene.solids)}.values())
+    kinds = Counter(
+        s.kind
+        for scene in scenes
+        for s in {s.kind: s for s in (*scene.beside, *scene.solids)}.values()
+    )
     kinds["stent"] = sum(bool(s.stents) for s in scenes)
     kinds["halo"] = sum(bool(s.halos) for s in scenes)
     kinds["two"] = sum(len(s.vessels) == 2 for s in scenes)
     kinds["core"] = sum(any(c.contrast for c in s.cores) for s in scenes)
     kinds["motion"] = sum(any(s.motion) for s in scenes)
     for name in (
-        "free", "beside", "strand", "nodule", "spotty", "calcification", "ulcer", "mural thrombus", "free thrombus",
-        "flap", "false lumen", "occlusion", "stent", "halo", "two", "core", "motion",
-    ):  # fmt: skip
+        "free",
+        "beside",
+        "strand",
+        "nodule",
+        "spotty",
+        "calcification",
+        "ulcer",
+        "mural thrombus",
+        "free thrombus",
+        "flap",
+        "false lumen",
+        "occlusion",
+        "stent",
+        "halo",
+        "two",
+        "core",
+        "motion",
+    ):
         assert kinds[name] >= 5, (name, kinds)
     contrasts = np.array([c.contrast for s in scenes for c in s.cores if c.contrast])
     config = SceneConfig()
@@ -92,15 +135,20 @@ def test_ellipsoid_has_its_volume_at_any_offset(axes: tuple) -> None:
         image = rasterise(TrainingScene(0.0, solids=(body,)), shape, 0.2).image.astype(np.float64)
         assert image.sum() * 0.008 == pytest.approx(4 / 3 * math.pi * math.prod(axes), rel=0.004)
         at = (np.arange(25) - 12) * 0.2
-        centroid = [float((image * w).sum() / image.sum()) for w in np.meshgrid(at, at, at, indexing="ij")]
+        centroid = [
+            float((image * w).sum() / image.sum()) for w in np.meshgrid(at, at, at, indexing="ij")
+        ]
         assert centroid == pytest.approx(centre[::-1], abs=0.003)
 
 
 @pytest.mark.parametrize("direction", [(0, 0, 1), (0.6, 0, 0.8), (1, 0, 0), (1, 1, 1)])
 def test_tubes_have_their_section_in_every_direction(direction: tuple) -> None:
-    """The volume of a straight tube in a ball is that of the cylinder in it, by points on a fine grid."""
+    """The volume of a straight tube in a ball is that of the cylinder in it, by points on a fine
+    grid."""
     d = np.array(direction, dtype=np.float64)
-    image = rasterise(TrainingScene(0.0, vessels=(tube(d, outer=0.9, start=(0, 0, 0)),)), (18, 18, 18), 0.2).image
+    image = rasterise(
+        TrainingScene(0.0, vessels=(tube(d, outer=0.9, start=(0, 0, 0)),)), (18, 18, 18), 0.2
+    ).image
     fine = (np.arange(180) - 89.5) * 0.02
     z, y, x = np.meshgrid(fine, fine, fine, indexing="ij", sparse=True)
     along = (x * d[0] + y * d[1] + z * d[2]) / np.linalg.norm(d)
@@ -111,7 +159,8 @@ def test_tubes_have_their_section_in_every_direction(direction: tuple) -> None:
 
 
 def test_a_ring_closes() -> None:
-    """A tube of constant curvature is a torus: its volume is 2π R times its section, and it stays on its circle."""
+    """A tube of constant curvature is a torus: its volume is 2π R times its section, and it
+    stays on its circle."""
     radius = 3.0
     line = curve(np.zeros(3), Z, np.stack([np.full(161, 1 / radius), np.zeros(161)], 1), 80)
     centre = line[6:9, 80] * radius
@@ -130,17 +179,29 @@ def test_a_ring_closes() -> None:
 
 def test_layers_are_nested() -> None:
     """Where faces are closer than a cell, nothing of what is outside gets in between."""
-    vessel = tube(outer=1.0, lumen=0.97, wall=0.02, wall_hu=0.0, fibrous_hu=0.0, lumen_hu=100.0, start=(0, 0, 0))
+    vessel = tube(
+        outer=1.0,
+        lumen=0.97,
+        wall=0.02,
+        wall_hu=0.0,
+        fibrous_hu=0.0,
+        lumen_hu=100.0,
+        start=(0, 0, 0),
+    )
     image = rasterise(TrainingScene(-1000.0, vessels=(vessel,)), (4, 14, 14), 0.2).image
     areas = math.pi * (100.0 * 0.97**2 + 1000.0) - 1000.0 * math.pi * (1 - 1.0**2)
     assert float(image[2].sum() + 1000.0 * 196) * 0.04 == pytest.approx(areas, rel=4e-3)
 
 
 def test_voxels_are_averages_of_finer_ones() -> None:
-    """Near faces, to a HU (0.5 % of the spread where something is very dense) of what takes 27 times as long."""
+    """Near faces, to a HU (0.5 % of the spread where something is very dense) of what takes 27
+    times as long."""
     errors, relative = [], []
-    # Wires are thinner than cells; where vessels meet, in a few cells, it is not known what lies in front of what.
-    config = SceneConfig(stent_probability=0.0, wide_probability=0.0, branch_probability=0.0, second_vessel=0.0)
+    # Wires are thinner than cells; where vessels meet, in a few cells, it is not known what lies in
+    # front of what.
+    config = SceneConfig(
+        stent_probability=0.0, wide_probability=0.0, branch_probability=0.0, second_vessel=0.0
+    )
     for seed in range(12):
         scene = draw_scene(seed, (2.4, 2.4, 2.4), config)
         coarse, fine = (rasterise(scene, (12, 12, 12), 0.2, cells).image for cells in (2, 6))
@@ -165,30 +226,53 @@ def test_data_are_blurred_and_the_truth_is_not() -> None:
 
 def test_masks_are_the_contrast() -> None:
     """Core and surround are the derivatives of the image by the HU of the two tissues."""
-    vessel = tube(outer=1.68, lumen=0.5, wall=0.19, fibrous_hu=92.0, lumen_hu=350.0, wall_hu=20.0, holds_core=True)
+    vessel = tube(
+        outer=1.68,
+        lumen=0.5,
+        wall=0.19,
+        fibrous_hu=92.0,
+        lumen_hu=350.0,
+        wall_hu=20.0,
+        holds_core=True,
+    )
 
     def paint(vessel: Vessel, *cores: Solid):
         return rasterise(paper_like(vessel, *cores), (24, 24, 24), 0.2)
 
     found = paint(vessel, core())
-    assert np.allclose(paint(vessel, core(hu=50.0)).image - found.image, 10 * found.signal, atol=1e-3)
     assert np.allclose(
-        paint(replace(vessel, fibrous_hu=102.0), core()).image - found.image, 10 * found.around, atol=1e-3
+        paint(vessel, core(hu=50.0)).image - found.image, 10 * found.signal, atol=1e-3
+    )
+    assert np.allclose(
+        paint(replace(vessel, fibrous_hu=102.0), core()).image - found.image,
+        10 * found.around,
+        atol=1e-3,
     )
     assert float(found.signal.max()) == pytest.approx(1.0)
     assert float(found.around.max()) == pytest.approx(1.0)
 
 
 def test_what_a_body_displaces_is_all_it_displaces() -> None:
-    """A crater fills the layer and leaves wall and fat; a thrombus fills the lumen and leaves the layer."""
-    vessel = tube(outer=1.5, lumen=0.8, wall=0.3, wall_hu=10.0, fibrous_hu=90.0, lumen_hu=400.0, start=(0, 0, 0))
+    """A crater fills the layer and leaves wall and fat; a thrombus fills the lumen and leaves
+    the layer."""
+    vessel = tube(
+        outer=1.5,
+        lumen=0.8,
+        wall=0.3,
+        wall_hu=10.0,
+        fibrous_hu=90.0,
+        lumen_hu=400.0,
+        start=(0, 0, 0),
+    )
     plain = rasterise(paper_like(vessel), (16, 20, 20), 0.2).image
     for tissue, hu, displaces, before in (
         (Tissue.LUMEN, 400.0, (Tissue.FIBROUS,), 90.0),
         (Tissue.INSERT, 60.0, (Tissue.LUMEN,), 400.0),
     ):
         body = Solid(tissue, hu, (0.9, 0.0, 0.0), (0.6, 0.5, 0.5), displaces, vessel=0)
-        changed = rasterise(replace(paper_like(vessel), solids=(body,)), (16, 20, 20), 0.2).image - plain
+        changed = (
+            rasterise(replace(paper_like(vessel), solids=(body,)), (16, 20, 20), 0.2).image - plain
+        )
         assert np.abs(changed).max() > 200.0
         pure = np.abs(plain - before) < 1e-3
         others = [np.abs(plain - v) < 1e-3 for v in (10.0, -90.0, 90.0, 400.0) if v != before]
@@ -202,11 +286,18 @@ def test_paper_family_is_recognised() -> None:
     assert is_paper_family(paper_like(vessel, core()))
     turned = core(semi_axes=(1.1, 0.5, 0.9), contrast=-36.0, vessel=1)
     assert is_paper_family(
-        replace(paper_like(tube(outer=1.3)), vessels=(tube(outer=1.3), tube(outer=1.8)), cores=(turned,))
+        replace(
+            paper_like(tube(outer=1.3)), vessels=(tube(outer=1.3), tube(outer=1.8)), cores=(turned,)
+        )
     )
     relatives = ([core(), core()], [core(contrast=-80.0)], [core(exponent=4.0)])
     assert all(is_paper_family(paper_like(vessel, *cores)) for cores in relatives)
-    others = ([core(contrast=-95.0)], [core(contrast=52.0)], [core(semi_axes=(0.6, 0.65, 0.985))], [])
+    others = (
+        [core(contrast=-95.0)],
+        [core(contrast=52.0)],
+        [core(semi_axes=(0.6, 0.65, 0.985))],
+        [],
+    )
     assert not any(is_paper_family(paper_like(vessel, *cores)) for cores in others)
     assert not is_paper_family(paper_like(tube(outer=1.3), core()))
 
@@ -219,7 +310,8 @@ def test_the_rule_takes_something_away(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_paper_family_is_never_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Even where the distribution is narrowed to the family, which shows that the rejection is what keeps it out."""
+    """Even where the distribution is narrowed to the family, which shows that the rejection is
+    what keeps it out."""
     config = SceneConfig(
         diameter=(3.1, 3.6),
         core_size=(0.55, 1.1),
@@ -235,16 +327,23 @@ def test_paper_family_is_never_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_texture_has_its_sd_and_length() -> None:
-    values = np.stack([Texture(8.0, 0.6, seed).field((12, 12, 12), (0.6, 0.6, 0.6)) for seed in range(40)])
-    # Averaging over voxels of 0.6 mm takes some of the variance: (1 + h² / 6 l²) ^ −1/2 per axis, or about
+    values = np.stack(
+        [Texture(8.0, 0.6, seed).field((12, 12, 12), (0.6, 0.6, 0.6)) for seed in range(40)]
+    )
+    # Averaging over voxels of 0.6 mm takes some of the variance: (1 + h² / 6 l²) ^ −1/2 per axis,
+    # or about
     assert values.std() == pytest.approx(8.0 * (1 + 1 / 6) ** -0.75, rel=0.05)
-    points = np.stack([Texture(8.0, 0.6, seed).field((10, 10, 10), (0.06, 0.06, 0.6)) for seed in range(80)])
+    points = np.stack(
+        [Texture(8.0, 0.6, seed).field((10, 10, 10), (0.06, 0.06, 0.6)) for seed in range(80)]
+    )
     correlation = np.mean(points[..., 1:] * points[..., :-1]) / np.mean(points**2)
     assert correlation == pytest.approx(math.exp(-0.5), abs=0.12)
 
 
 def test_bends_are_not_tighter_than_asked_for() -> None:
-    config = SceneConfig(bend_probability=1.0, bend_radius=(3.0, 3.0), diameter=(2.0, 2.0), free_probability=0.0)
+    config = SceneConfig(
+        bend_probability=1.0, bend_radius=(3.0, 3.0), diameter=(2.0, 2.0), free_probability=0.0
+    )
     tightest = []
     for seed in range(20):
         table = draw_scene(seed, EXTENT, config).vessels[0].table
@@ -266,8 +365,12 @@ def test_held_out_plaques() -> None:
         assert scene.vessels[0].diameter in (2.6, 4.4)
     axes = (-3, -2, -1)
     core_hu = (found.image * found.core_roi[:, None]).sum(axes) / found.core_roi.sum(axes)[:, None]
-    fibrous = (found.image * found.fibrous_roi[:, None]).sum(axes) / found.fibrous_roi.sum(axes)[:, None]
-    assert torch.allclose(core_hu - fibrous, torch.tensor([-60.0, -30.0, 0.0, 40.0]).expand(4, 4), atol=0.7)
+    fibrous = (found.image * found.fibrous_roi[:, None]).sum(axes) / found.fibrous_roi.sum(axes)[
+        :, None
+    ]
+    assert torch.allclose(
+        core_hu - fibrous, torch.tensor([-60.0, -30.0, 0.0, 40.0]).expand(4, 4), atol=0.7
+    )
     assert float((found.core_roi * found.fibrous_roi).max()) == 0.0
     assert float(found.core_roi.sum(axes).min()) >= 20
     assert float(found.fibrous_roi.sum(axes).min()) >= 20

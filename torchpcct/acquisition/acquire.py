@@ -1,4 +1,5 @@
-"""From a scene and a scanner to a scan: bodies → plan → expected readings → what the detector records → noise."""
+"""From a scene and a scanner to a scan: bodies → plan → expected readings → what the detector
+records → noise."""
 
 from __future__ import annotations
 
@@ -31,8 +32,12 @@ __all__ = ["acquire", "acquire_voxels", "detected", "plan", "signal_spectra"]
 _TOLERANCE = 1e-5
 """Error of a line integral over a metre of body by the number of basis maps."""
 _SUB_COLUMNS = 2
-"""Parts of a cell whose transmissions are averaged: a cell records the mean of the photons, not of the path lengths."""
-_LEFT_OUT = "focal spot, gantry turn during a view, scatter; voxels are uniform, and edges as coarse as they are"
+"""Parts of a cell whose transmissions are averaged: a cell records the mean of the photons, not
+of the path lengths."""
+_LEFT_OUT = (
+    "focal spot, gantry turn during a view, scatter; voxels are uniform, and edges as "
+    "coarse as they are"
+)
 VIEWS_AT_A_TIME = 64
 """Views whose readings are computed, and kept, together."""
 
@@ -47,8 +52,15 @@ def plan(
     tolerance_hu: float = 0.5,
     sub_rays: int | None = None,
 ) -> Plan:
-    """What :func:`acquire` would do with the same arguments: effects, errors in HU, time and memory."""
-    return make_plan(Bodies.of(scene, scanner.geometry, rotation_s, duty), scanner, region, tolerance_hu, sub_rays)
+    """What :func:`acquire` would do with the same arguments: effects, errors in HU, time and
+    memory."""
+    return make_plan(
+        Bodies.of(scene, scanner.geometry, rotation_s, duty),
+        scanner,
+        region,
+        tolerance_hu,
+        sub_rays,
+    )
 
 
 @checked
@@ -66,38 +78,50 @@ def acquire(
     progress: Callable[[float], None] | None = None,
     keep: Callable[[str, Callable[[], Tensor]], Tensor] | None = None,
 ) -> Scan:
-    """Simulate a scan: exact chords, polychromatic, finite focal spot, cells and views, quantum noise.
+    """Simulate a scan: exact chords, polychromatic, finite focal spot, cells and views, quantum
+    noise.
 
     Args:
-        scene: nested analytic bodies (mm), or a voxel volume, of which the whole detector is computed without the blur
-            of focal spot and turning gantry; none of the arguments after ``seed`` applies to it but ``progress``.
+        scene: nested analytic bodies (mm), or a voxel volume, of which the whole detector is
+            computed without the blur of focal spot and turning gantry; none of the arguments after
+            ``seed`` applies to it but ``progress``.
         scanner: source, filters, bowtie, detector and geometry.
-        exposure_s: duration of the (one-turn) scan in s at the source's current; None: expected readings.
-        seed: realisation of the noise, ≥ 0. A reading's noise depends on the seed and its place alone.
-        region: keep only the readings around this grid's footprint (the rest of the detector then reads the
-            rotationally symmetric bodies, noise free). All other bodies must lie inside.
+        exposure_s: duration of the (one-turn) scan in s at the source's current; None: expected
+            readings.
+        seed: realisation of the noise, ≥ 0. A reading's noise depends on the seed and its place
+            alone.
+        region: keep only the readings around this grid's footprint (the rest of the detector then
+            reads the rotationally symmetric bodies, noise free). All other bodies must lie inside.
         rotation_s: time of one turn in s, for moving scenes; None: ``exposure_s``.
-        duty: share of each view's time with the beam on: 1 continuous, → 0 pulsed (no blur by the gantry's turn).
-        tolerance_hu: effects of the beam that would change less than this are left out (see :func:`plan`).
-        sub_rays: number of beam samples a reading; None: as many as an error of 1e-3 of the peak needs.
+        duty: share of each view's time with the beam on: 1 continuous, → 0 pulsed (no blur by the
+            gantry's turn).
+        tolerance_hu: effects of the beam that would change less than this are left out (see
+            :func:`plan`).
+        sub_rays: number of beam samples a reading; None: as many as an error of 1e-3 of the peak
+            needs.
         progress: called with the finished fraction, 0…1.
-        keep: called with a name and what computes it for every block of views, returns its readings: computed, or
-            those that it kept of an interrupted simulation with the same arguments. None: nothing is kept.
+        keep: called with a name and what computes it for every block of views, returns its
+            readings: computed, or those that it kept of an interrupted simulation with the same
+            arguments. None: nothing is kept.
 
     Returns:
-        :class:`torchpcct.Scan`; counts float32. Of an energy-integrating detector: signals in keV, with the second
-        moment of the transmitted spectrum in ``quantum``, exact for every reading.
+        :class:`torchpcct.Scan`; counts float32. Of an energy-integrating detector: signals in keV,
+        with the second moment of the transmitted spectrum in ``quantum``, exact for every reading.
 
     Raises:
-        ValueError: ``exposure_s`` ≤ 0, a bad seed, bodies outside ``region``, a region outside the field of view, a
-            moving scene without ``rotation_s``, a ``duty`` outside (0, 1], ``tolerance_hu`` below 0 or NaN.
+        ValueError: ``exposure_s`` ≤ 0, a bad seed, bodies outside ``region``, a region outside the
+            field of view, a moving scene without ``rotation_s``, a ``duty`` outside (0, 1],
+            ``tolerance_hu`` below 0 or NaN.
         TypeError: an argument of the wrong kind.
     """
     check_exposure(exposure_s)
     seed = whole("seed", seed, low=0)
     if isinstance(scene, VoxelScene):
         if region is not None or rotation_s is not None or sub_rays is not None or duty != 1.0:
-            raise ValueError("a voxel volume is scanned whole, at rest: leave out region, rotation_s, duty, sub_rays")
+            raise ValueError(
+                "a voxel volume is scanned whole, at rest: leave out region, rotation_s, duty, "
+                "sub_rays"
+            )
         clean = acquire_voxels(scene, scanner, progress=progress)
         return clean if exposure_s is None else clean.with_noise(exposure_s, seed)
     start = time.perf_counter()
@@ -110,8 +134,12 @@ def acquire(
     # One view for all: the densest sampling of every effect costs nothing here.
     dense, one = beam._replace(points=sub_rays_of(SUB_RAY_COUNTS[-1])), g.select([0])
     symmetric, step = bodies.symmetric(energies, one), np.array([bodies.view_step])
-    surround = expected_readings(one, DetectorWindow.full(one), symmetric, dense, step).numpy()[:, 0]
-    counts = _readings(plan_, bodies, scanner, energies, beam, surround, progress, keep or _computed)
+    surround = expected_readings(one, DetectorWindow.full(one), symmetric, dense, step).numpy()[
+        :, 0
+    ]
+    counts = _readings(
+        plan_, bodies, scanner, energies, beam, surround, progress, keep or _computed
+    )
     info = {
         "scanner": scanner.name,
         "scene": list(scene.names),
@@ -129,7 +157,14 @@ def _computed(_: str, compute: Callable[[], Tensor]) -> Tensor:
 
 
 def _readings(
-    plan_: Plan, bodies: Bodies, scanner: Scanner, energies: Any, beam: Beam, surround: Any, progress: Any, keep: Any
+    plan_: Plan,
+    bodies: Bodies,
+    scanner: Scanner,
+    energies: Any,
+    beam: Beam,
+    surround: Any,
+    progress: Any,
+    keep: Any,
 ) -> Tensor:
     """Expected readings ``(bins, views, rows, columns)`` of the kept cells, float32."""
     g, active = scanner.geometry, plan_.active
@@ -141,15 +176,21 @@ def _readings(
         """What the bodies inside the region change, of the active cells."""
         assert active is not None
         part, step = g.select(views), np.full(views.stop - views.start, bodies.view_step)
-        found = expected_readings(part, active.select(views), bodies.at(energies, part), beam, step, surround)
+        found = expected_readings(
+            part, active.select(views), bodies.at(energies, part), beam, step, surround
+        )
         return found.to(torch.float32)
 
     for v0 in range(0, g.views, VIEWS_AT_A_TIME):
         views = slice(v0, min(v0 + VIEWS_AT_A_TIME, g.views))
-        out[:, views] = background[:, None] if plan_.kept is None else kept.select(views).take(background)
+        out[:, views] = (
+            background[:, None] if plan_.kept is None else kept.select(views).take(background)
+        )
         if active is not None:
             values = keep(f"views_{views.start}-{views.stop}", partial(near, views))
-            rows = slice(active.first_row - kept.first_row, active.first_row - kept.first_row + active.rows)
+            rows = slice(
+                active.first_row - kept.first_row, active.first_row - kept.first_row + active.rows
+            )
             for i, v in enumerate(range(views.start, views.stop)):
                 first = int(active.first_column[v] - kept.first_column[v])
                 low, high = max(first, 0), min(first + active.columns, kept.columns)
@@ -159,12 +200,14 @@ def _readings(
     return out
 
 
-def acquire_voxels(scene: VoxelScene, scanner: Scanner, *, progress: Callable[[float], None] | None = None) -> Scan:
+def acquire_voxels(
+    scene: VoxelScene, scanner: Scanner, *, progress: Callable[[float], None] | None = None
+) -> Scan:
     """The noise-free scan of a voxel volume, whole detector; called by :func:`torchpcct.acquire`.
 
     The attenuation of all tissues at all energies is compressed to a few basis maps
-    (:func:`~torchpcct.acquisition.transmission.compress`), which the distance-driven projector integrates over parts of
-    each cell; the polychromatic transmission is exact from there.
+    (:func:`~torchpcct.acquisition.transmission.compress`), which the distance-driven projector
+    integrates over parts of each cell; the polychromatic transmission is exact from there.
 
     Args:
         scene: tissues in voxels.
@@ -180,8 +223,11 @@ def acquire_voxels(scene: VoxelScene, scanner: Scanner, *, progress: Callable[[f
     scene = scene.read_by(energies, spectra[: scanner.detector.bins, g.columns // 2].sum(0))
     coefficients, basis = compress(scene.contrast(energies), tolerance=_TOLERANCE)
     maps = torch.from_numpy(scene.mixed(coefficients))
-    fine = replace(g, columns=g.columns * _SUB_COLUMNS, pitch=(g.pitch[0], g.pitch[1] / _SUB_COLUMNS))
-    weight = torch.from_numpy((spectra / _SUB_COLUMNS).astype(np.float32))  # (bins, columns, energies)
+    fine = replace(
+        g, columns=g.columns * _SUB_COLUMNS, pitch=(g.pitch[0], g.pitch[1] / _SUB_COLUMNS)
+    )
+    # (bins, columns, energies)
+    weight = torch.from_numpy((spectra / _SUB_COLUMNS).astype(np.float32))
     bins = weight.shape[0]
     rows = torch.from_numpy(np.asarray(scanner.row_factor, dtype=np.float32))
     spectrum = torch.from_numpy(basis.astype(np.float32))
@@ -210,7 +256,8 @@ def acquire_voxels(scene: VoxelScene, scanner: Scanner, *, progress: Callable[[f
 
 
 def _voxel_readings(lines: Tensor, spectrum: Tensor, weight: Tensor) -> Tensor:
-    """``(bins, rows, columns)`` of one view: ``lines (rank, rows, columns · sub)``, ``spectrum (rank, energies)``."""
+    """``(bins, rows, columns)`` of one view: ``lines (rank, rows, columns · sub)``, ``spectrum
+    (rank, energies)``."""
     out = lines.new_empty((weight.shape[0], lines.shape[1], weight.shape[1]))
     for r in range(lines.shape[1]):
         transmitted = torch.exp(-(lines[:, r].T @ spectrum))  # (columns · sub, energies)
@@ -220,10 +267,11 @@ def _voxel_readings(lines: Tensor, spectrum: Tensor, weight: Tensor) -> Tensor:
 
 
 def signal_spectra(scanner: Scanner) -> tuple[Any, Any, Any]:
-    """Energies, ``(bins, columns, energies)`` signal per energy in air, and the air readings ``(bins, rows, columns)``.
+    """Energies, ``(bins, columns, energies)`` signal per energy in air, and the air readings
+    ``(bins, rows, columns)``.
 
-    Of an energy-integrating detector the variance follows as one more "bin": the same transmission, weighted by the
-    squared signal.
+    Of an energy-integrating detector the variance follows as one more "bin": the same transmission,
+    weighted by the squared signal.
     """
     energies, spectra = scanner.weights()
     if scanner.detector.energy_integrating:
@@ -245,8 +293,8 @@ def detected(
 
     Args:
         scanner: whose detector it is.
-        counts: ``(bins, views, rows, columns)`` float32, the bins of :func:`signal_spectra`; overwritten, as the
-            readings of a whole detector are large.
+        counts: ``(bins, views, rows, columns)`` float32, the bins of :func:`signal_spectra`;
+            overwritten, as the readings of a whole detector are large.
         air, surround: ``(bins, rows, columns)``; surround None: of a scan without window.
         energies: ``(E,)`` keV.
         info: of the scan.

@@ -1,4 +1,5 @@
-"""A scene's bodies as the kernel reads them: packed once, then evaluated for the energies and views of each launch."""
+"""A scene's bodies as the kernel reads them: packed once, then evaluated for the energies and
+views of each launch."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ class BodySet(NamedTuple):
         contrast: ``(bodies, energies)`` Δμ in mm⁻¹.
         offsets: ``(bodies, views, 3)`` displacement in mm at the middle of each view.
         drift: ``(bodies, views, 3)`` displacement in mm over the duration of each view.
-        circle: ``(x, y, radius)`` in mm around all bodies at rest, seen along z; radius inf: every reading sees them.
+        circle: ``(x, y, radius)`` in mm around all bodies at rest, seen along z; radius inf: every
+            reading sees them.
     """
 
     kinds: NDArray[np.int64]
@@ -42,14 +44,16 @@ class BodySet(NamedTuple):
 
 @dataclass(frozen=True)
 class Bodies:
-    """A scene prepared for one turn: bodies that differ between views first, the rotationally symmetric ones last.
+    """A scene prepared for one turn: bodies that differ between views first, the rotationally
+    symmetric ones last.
 
     Attributes:
         scene: whose bodies they are.
         order: ``(B,)`` index in the scene of each prepared body; a moving body leads.
         varying: how many of them differ between views.
         kinds, params: packed at rest, in this order.
-        low, high: corners (x, y, z) mm of the varying bodies on all of their way; of all bodies if none varies.
+        low, high: corners (x, y, z) mm of the varying bodies on all of their way; of all bodies if
+            none varies.
         circle: see :class:`BodySet`.
         first_angle: rad, where the turn begins.
         view_step: rad that the gantry turns while a view is read.
@@ -76,12 +80,18 @@ class Bodies:
             ValueError: a moving scene without ``rotation_s``; a duty outside (0, 1].
         """
         if not 0 < duty <= 1:
-            raise ValueError(f"duty must lie in (0, 1], the share of a view's time with the beam on, got {duty}")
+            raise ValueError(
+                f"duty must lie in (0, 1], the share of a view's time with the beam on, got {duty}"
+            )
         moving = scene.moving
         if moving.any() and rotation_s is None:
-            raise ValueError("the scene moves: give rotation_s, the time of one turn in s (or exposure_s)")
+            raise ValueError(
+                "the scene moves: give rotation_s, the time of one turn in s (or exposure_s)"
+            )
         shapes = scene.shapes
-        symmetric = np.array([s.rotationally_symmetric and not m for s, m in zip(shapes, moving, strict=True)])
+        symmetric = np.array(
+            [s.rotationally_symmetric and not m for s, m in zip(shapes, moving, strict=True)]
+        )
         # A moving body leads: the circle around the varying bodies moves with the first of them.
         order = np.lexsort((np.arange(len(shapes)), ~moving, symmetric))
         varying = int((~symmetric).sum())
@@ -102,7 +112,8 @@ class Bodies:
         return cls(scene, order, varying, kinds, params, low, high, circle, angle, step, rotation_s)
 
     def at(self, energies: ArrayLike, geometry: ConeBeam, *, still: bool = False) -> BodySet:
-        """All bodies at ``energies`` (keV) in the views of ``geometry``; ``still``: as if nothing moved."""
+        """All bodies at ``energies`` (keV) in the views of ``geometry``; ``still``: as if
+        nothing moved."""
         offsets = np.zeros((self.order.size, geometry.views, 3))
         drift = np.zeros_like(offsets)
         if not (still or self.scene.is_static):
@@ -110,7 +121,9 @@ class Bodies:
             times = (geometry.angles - self.first_angle) / (2 * np.pi) * turn
             half = self.view_step / (2 * np.pi) * turn / 2
             offsets = self.scene.offsets(times)[self.order]
-            drift = (self.scene.offsets(times + half) - self.scene.offsets(times - half))[self.order]
+            drift = (self.scene.offsets(times + half) - self.scene.offsets(times - half))[
+                self.order
+            ]
         contrast = self.scene.contrast(energies)[self.order]
         return BodySet(self.kinds, self.params, contrast, offsets, drift, self.circle)
 
@@ -119,4 +132,6 @@ class Bodies:
         rest = slice(self.varying, None)
         still = np.zeros((self.order.size - self.varying, geometry.views, 3))
         contrast = self.scene.contrast(energies)[self.order[rest]]
-        return BodySet(self.kinds[rest], self.params[rest], contrast, still, still, (0.0, 0.0, math.inf))
+        return BodySet(
+            self.kinds[rest], self.params[rest], contrast, still, still, (0.0, 0.0, math.inf)
+        )

@@ -26,11 +26,12 @@ EXAMPLE = """\
 # A simulated scan: torchpcct simulate --config scene.yaml --out scan.h5
 scene:
   kind: bodies              # plaque, thorax, water, bodies, or volume
-  # plaque: the paper's; patient_diameter, core_contrast, motion_amplitude, the fields of Plaque (vessel_diameter,
-  #         core_scale, position), variant: stent; bodies: further ones, as below
+  # plaque: the paper's; patient_diameter, core_contrast, motion_amplitude, the fields of Plaque
+  #         (vessel_diameter, core_scale, position), variant: stent; bodies: further ones, as below
   # water: diameter, length, position
-  # volume: file: patient.nii.gz (a CT volume in HU), dense: bone, iodine, water or a file of labels 0, 1, 2 (what is
-  #         above muscle), energy_kev: 70 (mean energy of the volume's scan; null: its numbers come back)
+  # volume: file: patient.nii.gz (a CT volume in HU), dense: bone, iodine, water or a file of labels
+  #         0, 1, 2 (what is above muscle), energy_kev: 70 (mean energy of the volume's scan; null:
+  #         its numbers come back)
   bodies:                   # mm; parents before their children
     - {name: patient, shape: cylinder, semi_axes: {x: 160, y: 110}, material: soft_tissue}
     - name: spine
@@ -55,7 +56,8 @@ scanner:
   current_ma: 1000
 exposure_s: 1.0             # null: expected readings without noise
 seed: 0
-region: null                # grid to keep: {shape: {z: 40, y: 90, x: 90}, spacing: 0.2, center: {z: 0, y: 20, x: 40}}
+region: null                # grid to keep, such as
+  # {shape: {z: 40, y: 90, x: 90}, spacing: 0.2, center: {z: 0, y: 20, x: 40}}
 tolerance_hu: 0.5           # effects below it are left out
 """
 
@@ -70,7 +72,8 @@ class SimulationConfig:
     """What to simulate, built and checked.
 
     Attributes:
-        scene, scanner, region: objects for :func:`torchpcct.acquire`; region None: the whole detector.
+        scene, scanner, region: objects for :func:`torchpcct.acquire`; region None: the whole
+            detector.
         exposure_s, seed, tolerance_hu: numbers for it.
         values: the resolved YAML mapping, with every default.
     """
@@ -85,14 +88,17 @@ class SimulationConfig:
 
 
 def read_config(path: Path, **changes: Any) -> SimulationConfig:
-    """The configuration in a YAML file; ``changes`` replace its top-level values where they are not None.
+    """The configuration in a YAML file; ``changes`` replace its top-level values where they are not
+    None.
 
     Raises:
         FileNotFoundError: no such file.
         ValueError, TypeError: no mapping, unknown names, bad values; the message names them.
     """
     values = _mapping(str(path), read_yaml(path, "a configuration"), _KEYS)
-    return configured({**values, **{k: v for k, v in changes.items() if v is not None}}, path.parent)
+    return configured(
+        {**values, **{k: v for k, v in changes.items() if v is not None}}, path.parent
+    )
 
 
 def configured(values: Mapping[str, Any], folder: Path) -> SimulationConfig:
@@ -108,8 +114,14 @@ def configured(values: Mapping[str, Any], folder: Path) -> SimulationConfig:
     grid = None if region is None else grid_of("region", region)
     exposure, seed = values.get("exposure_s"), values.get("seed", 0)
     tolerance = number("tolerance_hu", values.get("tolerance_hu", 0.5), low=0.0, unit="HU")
-    resolved = {"scene": scene_values, "scanner": scanner_values, "exposure_s": exposure, "seed": seed,
-                "region": region, "tolerance_hu": tolerance}  # fmt: skip
+    resolved = {
+        "scene": scene_values,
+        "scanner": scanner_values,
+        "exposure_s": exposure,
+        "seed": seed,
+        "region": region,
+        "tolerance_hu": tolerance,
+    }
     return SimulationConfig(scene, scanner, grid, exposure, seed, tolerance, resolved)
 
 
@@ -122,7 +134,8 @@ def grid_of(name: str, value: Any) -> VolumeGrid:
 def _mapping(name: str, value: Any, keys: Any) -> dict[str, Any]:
     if not isinstance(value, Mapping):
         raise TypeError(
-            f"{name} must be a mapping with {', '.join(keys)}, got {value!r:.200}; see torchpcct show-config"
+            f"{name} must be a mapping with {', '.join(keys)}, got {value!r:.200}; see torchpcct "
+            "show-config"
         )
     unknown = [str(k) for k in value if k not in keys]
     if unknown:
@@ -132,11 +145,16 @@ def _mapping(name: str, value: Any, keys: Any) -> dict[str, Any]:
 
 def _parameters(function: Any) -> dict[str, Any]:
     """Parameters of a function or class with their defaults (none: empty)."""
-    return {n: p.default for n, p in inspect.signature(function).parameters.items() if p.kind is not p.VAR_KEYWORD}
+    return {
+        n: p.default
+        for n, p in inspect.signature(function).parameters.items()
+        if p.kind is not p.VAR_KEYWORD
+    }
 
 
 def _in_order(name: str, value: Any, order: str) -> Any:
-    """Numbers by the names of their axes as a list in the ``order`` that a function takes; anything else as it is.
+    """Numbers by the names of their axes as a list in the ``order`` that a function takes; anything
+    else as it is.
 
     Raises:
         ValueError: other names than those of the axes.
@@ -152,13 +170,18 @@ def _in_order(name: str, value: Any, order: str) -> Any:
 
 
 def _made(name: str, function: Any, given: Mapping[str, Any], order: str = "xyz") -> Any:
-    """What a function or class makes of the ``given`` parameters; those given by axis come in ``order``.
+    """What a function or class makes of the ``given`` parameters; those given by axis come in
+    ``order``.
 
     Raises:
         ValueError: one without a default is missing.
     """
     given = {k: _in_order(f"{name}.{k}", v, order) for k, v in given.items()}
-    missing = [n for n, d in _parameters(function).items() if d is inspect.Parameter.empty and n not in given]
+    missing = [
+        n
+        for n, d in _parameters(function).items()
+        if d is inspect.Parameter.empty and n not in given
+    ]
     if missing:
         raise ValueError(f"{name} needs {', '.join(missing)}")
     return function(**given)
@@ -166,7 +189,9 @@ def _made(name: str, function: Any, given: Mapping[str, Any], order: str = "xyz"
 
 def _scanner(value: Any) -> tuple[Scanner, dict[str, Any]]:
     given = dict(value) if isinstance(value, Mapping) else {}
-    preset = choice("scanner.preset", given.pop("preset", "pcct" if value is None else None), tuple(_PRESETS))
+    preset = choice(
+        "scanner.preset", given.pop("preset", "pcct" if value is None else None), tuple(_PRESETS)
+    )
     known = {n: d for n, d in _parameters(_PRESETS[preset]).items() if n != "detector"}
     resolved = {**known, **_mapping("scanner", given, tuple(known))}
     return _PRESETS[preset](**resolved), {"preset": preset, **resolved}
@@ -174,14 +199,21 @@ def _scanner(value: Any) -> tuple[Scanner, dict[str, Any]]:
 
 def _scene(value: Any, folder: Path) -> tuple[Scene | VoxelScene, dict[str, Any]]:
     if not isinstance(value, Mapping):
-        raise TypeError(f"scene must be a mapping with kind, got {value!r}; see torchpcct show-config")
+        raise TypeError(
+            f"scene must be a mapping with kind, got {value!r}; see torchpcct show-config"
+        )
     given = dict(value)
-    kind = choice("scene.kind", given.pop("kind", None), ("plaque", "thorax", "water", "bodies", "volume"))
+    kind = choice(
+        "scene.kind", given.pop("kind", None), ("plaque", "thorax", "water", "bodies", "volume")
+    )
     if kind == "volume":
         return _voxels(_mapping("scene", given, ("file", "energy_kev", "dense")), folder)
     if kind == "bodies":
         _mapping("scene", given, ("bodies",))
-        return Scene([_body(k, b) for k, b in enumerate(given.get("bodies") or [])]), {"kind": kind, **given}
+        return Scene([_body(k, b) for k, b in enumerate(given.get("bodies") or [])]), {
+            "kind": kind,
+            **given,
+        }
     from torchpcct.scene.phantoms.quality import water_cylinder  # load what is asked for only
     from torchpcct.scene.phantoms.thorax import thorax
     from torchpcct.scene.plaque import Plaque, plaque_scene
@@ -229,9 +261,13 @@ def _voxels(given: dict[str, Any], folder: Path) -> tuple[VoxelScene, dict[str, 
     }
     if dense not in DENSE:
         if not isinstance(dense, str) or not (folder / dense).exists():
-            raise ValueError(f"scene.dense must be {', '.join(DENSE)}, or a volume file of labels, got {dense!r}")
+            raise ValueError(
+                f"scene.dense must be {', '.join(DENSE)}, or a volume file of labels, got {dense!r}"
+            )
         labels = Volume.load(folder / dense)
         if labels.grid != volume.grid:
             raise ValueError(f"scene.dense: the voxels of {dense} are not those of {given['file']}")
         description["dense"], dense = str((folder / dense).resolve()), np.asarray(labels.data)
-    return VoxelScene(np.asarray(volume.data), volume.grid, energies_kev=energy, dense=dense), description
+    return VoxelScene(
+        np.asarray(volume.data), volume.grid, energies_kev=energy, dense=dense
+    ), description

@@ -1,8 +1,9 @@
-"""Exact path lengths of rays in the tissues of a scene, averaged over the finite beam of every reading.
+"""Exact path lengths of rays in the tissues of a scene, averaged over the finite beam of every
+reading.
 
-A tissue is a body WITHOUT what lies inside it, so the tissues of a scene are disjoint and their path lengths add up to
-the chord of the outermost body. They are the columns of the linear model that the limit of
-:mod:`torchpcct.metrics.data_limit` rests on.
+A tissue is a body WITHOUT what lies inside it, so the tissues of a scene are disjoint and their
+path lengths add up to the chord of the outermost body. They are the columns of the linear model
+that the limit of :mod:`torchpcct.metrics.data_limit` rests on.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from torchpcct.scene.scene import Scene
 __all__ = ["tissue_path_lengths"]
 
 _MU = 1e-4
-"""mm⁻¹ of the medium whose readings tell its path: so thin that they are computed to second order everywhere."""
+"""mm⁻¹ of the medium whose readings tell its path: so thin that they are computed to second
+order everywhere."""
 _VIEWS = 16
 """Views whose readings are held at once."""
 
@@ -45,11 +47,12 @@ def tissue_path_lengths(
 
     Args:
         scene: bodies at rest.
-        names: for every tissue the name of its body, or several names whose path lengths are added. What lies
-            inside a body does not count to it.
+        names: for every tissue the name of its body, or several names whose path lengths are added.
+            What lies inside a body does not count to it.
         geometry: cone beam.
         window: the cells to compute; None: the whole detector.
-        sub_rays: beam samples a reading, one of :data:`torchpcct.acquisition.transmission.SUB_RAY_COUNTS`.
+        sub_rays: beam samples a reading, one of
+            :data:`torchpcct.acquisition.transmission.SUB_RAY_COUNTS`.
         focal_spot: ``(width, length)`` in mm, along ``e_t`` and z; 0: a point.
         view_step: rad that the gantry turns while a view is read; 0: standing still.
         dtype: of the result; the chords are computed in float64.
@@ -58,20 +61,23 @@ def tissue_path_lengths(
         ``(tissues, views, rows, columns)`` in mm.
 
     Raises:
-        ValueError: no names, an unknown or repeated body, a moving scene, a window of other views, a bad ``sub_rays``.
+        ValueError: no names, an unknown or repeated body, a moving scene, a window of other views,
+            a bad ``sub_rays``.
         TypeError: a geometry that is not a cone beam.
     """
     if not isinstance(geometry, ConeBeam):
         raise TypeError(f"geometry must be a ConeBeam, got {type(geometry).__name__}")
     if not scene.is_static:
-        raise ValueError("the scene moves: path lengths are those of one place, give scene.with_motion(None)")
+        raise ValueError(
+            "the scene moves: path lengths are those of one place, give scene.with_motion(None)"
+        )
     if window is None:
         window = DetectorWindow.full(geometry)
     window.check(geometry)
     used, mixing = _mixing(scene, names)
     kinds, params = pack([scene.shapes[b] for b in used])
-    # Of a medium of μ and one of −μ: a reading is exp(−μ mean + μ² variance / 2), so that half the difference of the
-    # logarithms is the mean path times μ.
+    # Of a medium of μ and one of −μ: a reading is exp(−μ mean + μ² variance / 2), so that half the
+    # difference of the logarithms is the mean path times μ.
     contrast = _MU * np.concatenate([mixing.T, -mixing.T], axis=1)
     active = (focal_spot[0] > 0, focal_spot[1] > 0, True, True, view_step > 0)
     alone = np.repeat(np.eye(2 * len(names))[:, None], geometry.columns, axis=1)
@@ -81,13 +87,16 @@ def tissue_path_lengths(
         views = slice(first, min(first + _VIEWS, geometry.views))
         part, still = geometry.select(views), np.zeros((len(used), views.stop - first, 3))
         bodies = BodySet(kinds, params, contrast, still, still, (0.0, 0.0, np.inf))
-        logs = expected_readings(part, window.select(views), bodies, beam, np.full(part.views, view_step)).log()
+        logs = expected_readings(
+            part, window.select(views), bodies, beam, np.full(part.views, view_step)
+        ).log()
         out[:, views] = ((logs[len(names) :] - logs[: len(names)]) / (2.0 * _MU)).to(dtype)
     return out
 
 
 def _mixing(scene: Scene, names: Sequence[str | Sequence[str]]) -> tuple[list[int], Any]:
-    """The bodies whose chords are needed, and the ``(tissues, bodies)`` signs that turn chords into path lengths."""
+    """The bodies whose chords are needed, and the ``(tissues, bodies)`` signs that turn chords
+    into path lengths."""
     if isinstance(names, str) or not len(names):
         raise ValueError(f"names must be a non-empty sequence of bodies, got {names!r}")
     signs = np.zeros((len(names), len(scene)))

@@ -1,9 +1,10 @@
 """What a scan needs to be simulated faithfully, decided by measuring on a few of its own views.
 
-Every effect of the finite beam and of the spectrum can be switched off; a scene that does not need it should not pay
-for it. :func:`make_plan` computes a sparse sample of the scan with everything on and densely sampled, then without
-each effect in turn, and keeps the effects whose omission would cost more than the stated tolerance. What the detector
-makes of the readings is its own choice (dead time, charge sharing): the plan says so.
+Every effect of the finite beam and of the spectrum can be switched off; a scene that does not need
+it should not pay for it. :func:`make_plan` computes a sparse sample of the scan with everything on
+and densely sampled, then without each effect in turn, and keeps the effects whose omission would
+cost more than the stated tolerance. What the detector makes of the readings is its own choice (dead
+time, charge sharing): the plan says so.
 """
 
 from __future__ import annotations
@@ -25,19 +26,29 @@ from torchpcct.validate import number
 
 __all__ = ["Effect", "Plan", "make_plan"]
 
-_PROBE_VIEWS, _PROBE_ROWS = 6, 3
-# Sub-rays of the runs that weigh the effects, and of the one that a smaller number of sub-rays must reproduce.
-_EFFECT_SUB_RAYS, _TARGET_SUB_RAYS = 32, 256
-# Rms error of the line integrals by the finite number of sub-rays, relative to the inset's highest one.
+_PROBE_VIEWS = 6
+_PROBE_ROWS = 3
+# Sub-rays of the runs that weigh the effects, and of the one that a smaller number of sub-rays must
+# reproduce.
+_EFFECT_SUB_RAYS = 32
+_TARGET_SUB_RAYS = 256
+# Rms error of the line integrals by the finite number of sub-rays, relative to the inset's highest
+# one.
 _PEAK_ERROR = 1e-3
 
 _LEFT_OUT = (
-    ("scatter", "no scatter model: an anti-scatter grid and correction are assumed, as in the paper"),
+    (
+        "scatter",
+        "no scatter model: an anti-scatter grid and correction are assumed, as in the paper",
+    ),
     (
         "focal spot intensity, heel effect",
         "the focal spot is a uniform rectangle, the spectrum the same over the field",
     ),
-    ("afterglow, readout cross-talk", "counting silicon has no afterglow; tungsten foils part the columns"),
+    (
+        "afterglow, readout cross-talk",
+        "counting silicon has no afterglow; tungsten foils part the columns",
+    ),
 )
 
 
@@ -56,11 +67,14 @@ class Plan:
     """What :func:`torchpcct.acquire` will compute.
 
     Attributes:
-        effects: every effect with its cost in HU (rms over the footprint of the inset, per its mean chord).
-        points: ``(sub-rays, 5)`` beam samples of :func:`torchpcct.acquisition.transmission.sub_rays`.
+        effects: every effect with its cost in HU (rms over the footprint of the inset, per its mean
+            chord).
+        points: ``(sub-rays, 5)`` beam samples of
+            :func:`torchpcct.acquisition.transmission.sub_rays`.
         active: the readings that see the varying bodies; None: no view differs from another.
         kept: the readings that the scan will hold; None: the whole detector.
-        sampling_error: rms error of a line integral by the finite number of sub-rays, relative to the inset's peak.
+        sampling_error: rms error of a line integral by the finite number of sub-rays, relative to
+            the inset's peak.
         readings, seconds, bytes: size, estimated time and memory.
         tolerance_hu: the tolerance that decided.
     """
@@ -80,10 +94,17 @@ class Plan:
         lines = [f"Plan (tolerance {self.tolerance_hu:g} HU)"]
         for e in self.effects:
             cost = "  not estimated" if e.cost_hu is None else f"{e.cost_hu:9.2f} HU if omitted"
-            lines.append(f"  {'modelled ' if e.modelled else 'left out '} {e.name:<34} {cost:<22} {e.note}".rstrip())
+            lines.append(
+                (
+                    f"  {'modelled ' if e.modelled else 'left out '} {e.name:<34} {cost:<22} "
+                    f"{e.note}"
+                ).rstrip()
+            )
         lines.append(
-            f"  {len(self.points)} sub-rays a reading, rms sampling error {self.sampling_error:.1e} of the peak; "
-            f"{self.readings / 1e6:.2f} M readings, about {self.seconds:.0f} s, {self.bytes / 2**30:.2f} GiB"
+            f"  {len(self.points)} sub-rays a reading, rms sampling error "
+            f"{self.sampling_error:.1e} of the peak; "
+            f"{self.readings / 1e6:.2f} M readings, about {self.seconds:.0f} s, "
+            f"{self.bytes / 2**30:.2f} GiB"
         )
         return "\n".join(lines)
 
@@ -112,7 +133,8 @@ def active_window(geometry: ConeBeam, bodies: Bodies) -> DetectorWindow:
 
 
 def _kept_window(geometry: ConeBeam, region: VolumeGrid, bodies: Bodies) -> DetectorWindow:
-    """The readings around the footprint of ``region``, every row; it must hold all bodies that vary."""
+    """The readings around the footprint of ``region``, every row; it must hold all bodies that
+    vary."""
     kept = footprint(geometry, region, margin=NOISE_MARGIN_COLUMNS).with_rows(0, geometry.rows)
     if bodies.varying:
         # Without the four columns for the beam's width.
@@ -123,13 +145,15 @@ def _kept_window(geometry: ConeBeam, region: VolumeGrid, bodies: Bodies) -> Dete
         if not inside.all():
             raise ValueError(
                 "region does not hold all bodies that differ between views (box "
-                f"{np.round(bodies.low, 1)} … {np.round(bodies.high, 1)} mm): enlarge it, or acquire without region"
+                f"{np.round(bodies.low, 1)} … {np.round(bodies.high, 1)} mm): enlarge it, or "
+                "acquire without region"
             )
     return kept
 
 
 class _Probe:
-    """A sparse sample of the scan: a few views and rows, all columns that see the varying bodies."""
+    """A sparse sample of the scan: a few views and rows, all columns that see the varying
+    bodies."""
 
     def __init__(self, bodies: Bodies, scanner: Scanner) -> None:
         g = scanner.geometry
@@ -142,13 +166,20 @@ class _Probe:
         self.seconds = 0.0
 
     def run(
-        self, active: Sequence[bool], count: int, *, background: bool = False, mono: bool = False, still: bool = False
+        self,
+        active: Sequence[bool],
+        count: int,
+        *,
+        background: bool = False,
+        mono: bool = False,
+        still: bool = False,
     ) -> Any:
         """Line integrals of the probe, ``(views, rows, columns)``.
 
         Args:
             active, count: of :func:`~torchpcct.acquisition.transmission.sub_rays`.
-            background: without the bodies that vary. mono: at the mean energy. still: as if nothing moved.
+            background: without the bodies that vary. mono: at the mean energy. still: as if nothing
+                moved.
         """
         energies, spectra = self.scanner.weights()
         spectra = spectra.sum(0, keepdims=True)
@@ -157,10 +188,21 @@ class _Probe:
             energies = np.array([float(mean.mean())])
             spectra = spectra.sum(-1, keepdims=True)
         g, w = self.geometry, self.window
-        bodies = self.bodies.symmetric(energies, g) if background else self.bodies.at(energies, g, still=still)
-        beam = Beam(spectra, self.scanner.row_factor, self.scanner.source.focal_spot, sub_rays(count, active))
+        bodies = (
+            self.bodies.symmetric(energies, g)
+            if background
+            else self.bodies.at(energies, g, still=still)
+        )
+        beam = Beam(
+            spectra,
+            self.scanner.row_factor,
+            self.scanner.source.focal_spot,
+            sub_rays(count, active),
+        )
         start = time.perf_counter()
-        readings = expected_readings(g, w, bodies, beam, np.full(g.views, self.bodies.view_step)).numpy()
+        readings = expected_readings(
+            g, w, bodies, beam, np.full(g.views, self.bodies.view_step)
+        ).numpy()
         self.seconds = time.perf_counter() - start
         air = np.einsum("bce,r->rc", spectra, self.scanner.row_factor)
         air = air[w.first_row : w.first_row + w.rows][:, w.column_indices].transpose(1, 0, 2)
@@ -170,12 +212,16 @@ class _Probe:
 def _detector_effects(scanner: Scanner) -> list[Effect]:
     """Pile-up and charge sharing, as the scanner's detector has them."""
     dead_ns, merge_ns, shared = (
-        float(getattr(scanner.detector, name, 0.0)) for name in ("dead_time_ns", "merge_ns", "charge_sharing")
+        float(getattr(scanner.detector, name, 0.0))
+        for name in ("dead_time_ns", "merge_ns", "charge_sharing")
     )
     far = "behind the body the count rate is far below the detector's limit"
     if not (dead_ns or shared):
         return [Effect("pile-up, charge sharing", False, None, far)]
-    lost = f"dead time {dead_ns:g} ns, merging time {merge_ns:g} ns at {scanner.source.current_ma:g} mA"
+    lost = (
+        f"dead time {dead_ns:g} ns, merging time {merge_ns:g} ns at "
+        f"{scanner.source.current_ma:g} mA"
+    )
     split = f"{100 * shared:g} % of the interactions" if shared else "switched off"
     return [
         Effect("pile-up", dead_ns > 0, None, lost if dead_ns else far),
@@ -184,7 +230,11 @@ def _detector_effects(scanner: Scanner) -> list[Effect]:
 
 
 def make_plan(
-    bodies: Bodies, scanner: Scanner, region: VolumeGrid | None, tolerance_hu: float, sub_ray_count: int | None = None
+    bodies: Bodies,
+    scanner: Scanner,
+    region: VolumeGrid | None,
+    tolerance_hu: float,
+    sub_ray_count: int | None = None,
 ) -> Plan:
     """Decide what to model; see :class:`Plan`. Called by :func:`torchpcct.acquire`.
 
@@ -196,7 +246,8 @@ def make_plan(
         sub_ray_count: force a number of sub-rays instead of choosing it.
 
     Raises:
-        ValueError: bodies that vary outside ``region``, a region outside the field of view; a tolerance below 0 or NaN.
+        ValueError: bodies that vary outside ``region``, a region outside the field of view; a
+            tolerance below 0 or NaN.
         TypeError: a tolerance that is no number.
     """
     number("tolerance_hu", tolerance_hu, low=0.0, unit="HU")
@@ -211,17 +262,21 @@ def make_plan(
     peak = float(np.abs(inset).max())
     mask = np.abs(inset) > 1e-3 * peak
     mu_water = scanner.water_linearisation().mu_ref
-    # The rms error is spread over half the diagonal of the bodies' box: a chord typical of the inset.
+    # The rms error is spread over half the diagonal of the bodies' box: a chord typical of the
+    # inset.
     chord = max(float(np.linalg.norm((bodies.high - bodies.low)[:2])) / 2, 1.0)
 
     def cost(difference: Any) -> float:
-        """Error of the line integrals as a CT number: rms over the footprint, spread over the bodies' chord."""
+        """Error of the line integrals as a CT number: rms over the footprint, spread over the
+        bodies' chord."""
         if not mask.any():
             return 0.0
         rms = math.sqrt(float(np.mean(difference[mask] ** 2)))
         return 1000.0 * rms / (mu_water * chord)
 
-    mono = probe.run(everything, _EFFECT_SUB_RAYS, mono=True) - probe.run(everything, 16, background=True, mono=True)
+    mono = probe.run(everything, _EFFECT_SUB_RAYS, mono=True) - probe.run(
+        everything, 16, background=True, mono=True
+    )
     scale = float((inset * mono).sum() / max(float((mono * mono).sum()), 1e-300))
     hardening = "after the best single scale factor"
     effects = [Effect("polychromatic spectrum", True, cost(inset - scale * mono), hardening)]
@@ -244,12 +299,15 @@ def make_plan(
     scatter, *beam = (Effect(name, False, None, note) for name, note in _LEFT_OUT)
     effects += [scatter, *_detector_effects(scanner), *beam]
 
-    # Full-sampled reference with only the chosen effects: what the number of sub-rays must reproduce.
+    # Full-sampled reference with only the chosen effects: what the number of sub-rays must
+    # reproduce.
     chosen = tuple(active)
     target = probe.run(chosen, _TARGET_SUB_RAYS)
     count, error = 1, 0.0
     for count in SUB_RAY_COUNTS if sub_ray_count is None else (sub_ray_count,):
-        error = math.sqrt(float(np.mean((probe.run(chosen, count) - target) ** 2))) / max(peak, 1e-300)
+        error = math.sqrt(float(np.mean((probe.run(chosen, count) - target) ** 2))) / max(
+            peak, 1e-300
+        )
         if error <= _PEAK_ERROR:
             break
     points = sub_rays(count, chosen)

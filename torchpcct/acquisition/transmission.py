@@ -1,19 +1,21 @@
-"""Expected detector readings of analytic bodies: exact chords, polychromatic, averaged over the finite beam.
+"""Expected detector readings of analytic bodies: exact chords, polychromatic, averaged over the
+finite beam.
 
 For one reading (bin i, view, row, column) the expected signal is
 
     N_i = Σ_E S_i(column, E) · ⟨exp(−Σ_b chord_b · Δμ_b(E))⟩ · row factor,
 
-where ⟨·⟩ is the mean over sub-rays from points of the focal spot to points of the cell at moments of the view, and
-Δμ_b is the attenuation of body b minus that of the body around it (see :mod:`torchpcct.scene.scene`). Two exact or
-controlled reductions make this fast:
+where ⟨·⟩ is the mean over sub-rays from points of the focal spot to points of the cell at moments
+of the view, and Δμ_b is the attenuation of body b minus that of the body around it (see
+:mod:`torchpcct.scene.scene`). Two exact or controlled reductions make this fast:
 
-* the matrix Δμ (bodies × energies) has a low numerical rank: chords are carried in ``rank`` components instead of
-  ``bodies × energies`` products (:func:`compress`, residual below 1e-9 in the line integral);
-* the mean of the exponential over the sub-rays of ONE cell is taken to second order in the spread of the line
-  integral inside the cell, ``exp(−mean + variance / 2)`` per energy. The neglected third cumulant is below
-  1e-6 for tissue and iodine edges and is measured in the tests against the full sum. Where the spread is large
-  (edges of metal, soft rays) the full sum is taken.
+* the matrix Δμ (bodies × energies) has a low numerical rank: chords are carried in ``rank``
+  components instead of ``bodies × energies`` products (:func:`compress`, residual below 1e-9 in the
+  line integral);
+* the mean of the exponential over the sub-rays of ONE cell is taken to second order in the spread
+  of the line integral inside the cell, ``exp(−mean + variance / 2)`` per energy. The neglected
+  third cumulant is below 1e-6 for tissue and iodine edges and is measured in the tests against the
+  full sum. Where the spread is large (edges of metal, soft rays) the full sum is taken.
 """
 
 from __future__ import annotations
@@ -45,7 +47,8 @@ class Beam(NamedTuple):
     """The finite, polychromatic beam of one reading.
 
     Attributes:
-        spectra: ``(bins, columns, energies)`` expected signal of an unattenuated reading per energy.
+        spectra: ``(bins, columns, energies)`` expected signal of an unattenuated reading per
+            energy.
         row_factor: ``(rows,)`` relative intensity of the rows.
         focal_spot: ``(width, length)`` in mm, along ``e_t`` and z.
         points: ``(sub-rays, 5)`` of :func:`sub_rays`.
@@ -61,8 +64,8 @@ SUB_RAY_COUNTS = (1, 16, 32, 64, 128, 256)
 """Numbers of sub-rays that :func:`sub_rays` knows."""
 
 LARGE_VARIANCE = 0.01
-"""Variance of a line integral inside a cell beyond which the mean to second order gives way to the full sum (the third
-cumulant reaches 1e-4)."""
+"""Variance of a line integral inside a cell beyond which the mean to second order gives way to the
+full sum (the third cumulant reaches 1e-4)."""
 
 # Plastic-number sequence (Roberts 2018): two coordinates that fill the square evenly at any length.
 _PLASTIC = 1.0 / 1.32471795724474602596
@@ -71,10 +74,11 @@ _PLASTIC = 1.0 / 1.32471795724474602596
 def sub_rays(count: int, active: Sequence[bool] = (True,) * 5) -> Floats:
     """Sub-ray coordinates, ``(count, 5)`` in −½…½: focal width, focal length, column, row, view.
 
-    What blurs a thin object in the plane is the sum of three boxes: cell, focal spot and the gantry's turn. A body's
-    edge makes a kink along that sum, so it is sampled finely: many equidistant points across the cell, shifted by
-    the few Gauss points of the two others. Along z the blur is gentle and gets two coordinates of a low-discrepancy
-    sequence. The mean over all points is 0 on every axis, so no reading is shifted. Inactive axes stay at 0.
+    What blurs a thin object in the plane is the sum of three boxes: cell, focal spot and the
+    gantry's turn. A body's edge makes a kink along that sum, so it is sampled finely: many
+    equidistant points across the cell, shifted by the few Gauss points of the two others. Along z
+    the blur is gentle and gets two coordinates of a low-discrepancy sequence. The mean over all
+    points is 0 on every axis, so no reading is shifted. Inactive axes stay at 0.
 
     Raises:
         ValueError: ``count`` is not one of :data:`SUB_RAY_COUNTS`.
@@ -89,7 +93,9 @@ def sub_rays(count: int, active: Sequence[bool] = (True,) * 5) -> Floats:
     across = count // (focal.size * view.size)
     column = (np.arange(across) + 0.5) / across - 0.5 if active[2] else np.zeros(across)
     points = np.zeros((count, 5))
-    points[:, 0], points[:, 4], points[:, 2] = (a.ravel() for a in np.meshgrid(focal, view, column, indexing="ij"))
+    points[:, 0], points[:, 4], points[:, 2] = (
+        a.ravel() for a in np.meshgrid(focal, view, column, indexing="ij")
+    )
     order = np.arange(1.0, count + 1)
     for axis, step in ((1, _PLASTIC), (3, _PLASTIC**2)):
         if active[axis]:
@@ -105,11 +111,14 @@ def _nodes(count: int) -> Floats:
     return (np.arange(count) + 0.5) / count - 0.5
 
 
-def compress(contrast: Floats, longest_mm: float = 1000.0, tolerance: float = 1e-9) -> tuple[Floats, Floats]:
-    """Factor ``contrast`` (bodies, energies) = coefficients (bodies, rank) @ basis (rank, energies).
+def compress(
+    contrast: Floats, longest_mm: float = 1000.0, tolerance: float = 1e-9
+) -> tuple[Floats, Floats]:
+    """Factor ``contrast`` (bodies, energies) = coefficients (bodies, rank) @ basis (rank,
+    energies).
 
-    The rank is the smallest for which a chord of ``longest_mm`` changes the line integral by less than ``tolerance``;
-    0 without bodies.
+    The rank is the smallest for which a chord of ``longest_mm`` changes the line integral by less
+    than ``tolerance``; 0 without bodies.
     """
     u, s, vt = np.linalg.svd(contrast, full_matrices=False)
     for rank in range(s.size + 1):
@@ -121,11 +130,36 @@ def compress(contrast: Floats, longest_mm: float = 1000.0, tolerance: float = 1e
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _readings(
-    begin: int, end: int, cos_b: Any, sin_b: Any, view_step: Any, sod: float, sdd: float, curved: bool, u0: float,
-    du: float, v0: float, dv: float, focal_w: float, focal_l: float, points: Any, kinds: Any, params: Any,
-    coefficients: Any, basis: Any, offsets: Any, drift: Any, circle: Any, reach: float, spectra: Any, row_factor: Any,
-    first_column: Any, first_row: int, surround: Any, out: Any,
-) -> None:  # fmt: skip
+    begin: int,
+    end: int,
+    cos_b: Any,
+    sin_b: Any,
+    view_step: Any,
+    sod: float,
+    sdd: float,
+    curved: bool,
+    u0: float,
+    du: float,
+    v0: float,
+    dv: float,
+    focal_w: float,
+    focal_l: float,
+    points: Any,
+    kinds: Any,
+    params: Any,
+    coefficients: Any,
+    basis: Any,
+    offsets: Any,
+    drift: Any,
+    circle: Any,
+    reach: float,
+    spectra: Any,
+    row_factor: Any,
+    first_column: Any,
+    first_row: int,
+    surround: Any,
+    out: Any,
+) -> None:
     bins, _, rows, columns = out.shape
     energies = basis.shape[1]
     rank = basis.shape[0]
@@ -145,7 +179,8 @@ def _readings(
                 column = first_column[view] + j
                 u_mid = u0 + column * du
                 if has_surround:
-                    # Distance of the centre ray from the bodies' circle: most readings pass far outside.
+                    # Distance of the centre ray from the bodies' circle: most readings pass far
+                    # outside.
                     if curved:
                         gamma = u_mid / sdd
                         lx, ly = -math.cos(gamma), math.sin(gamma)
@@ -187,12 +222,15 @@ def _readings(
                     for b in range(bodies):
                         t = points[k, 4]
                         t0, t1 = interval(
-                            kinds[b], params[b],
+                            kinds[b],
+                            params[b],
                             ox - offsets[b, view, 0] - t * drift[b, view, 0],
                             oy - offsets[b, view, 1] - t * drift[b, view, 1],
                             sz - offsets[b, view, 2] - t * drift[b, view, 2],
-                            dx, dy, dz,
-                        )  # fmt: skip
+                            dx,
+                            dy,
+                            dz,
+                        )
                         if t1 > t0:
                             for a in range(rank):
                                 sample[a] += (t1 - t0) * coefficients[b, a]
@@ -260,7 +298,8 @@ def expected_readings(
         bodies: packed bodies; their first entry moves as the circle does.
         beam: spectra, focal spot and sub-rays.
         view_step: ``(views,)`` rad the gantry turns while a view is read.
-        surround: ``(bins, rows, columns)`` readings of the rays that miss the bodies' circle; None computes all.
+        surround: ``(bins, rows, columns)`` readings of the rays that miss the bodies' circle; None
+            computes all.
 
     Returns:
         ``(bins, views, window.rows, window.columns)`` float64.
@@ -294,13 +333,35 @@ def expected_readings(
     )
     empty = np.empty((0, 0, 0))
     run(
-        _readings, geometry.views, np.cos(geometry.angles), np.sin(geometry.angles), np.ascontiguousarray(view_step),
-        geometry.sod, geometry.sdd, geometry.detector == "curved", geometry.column_positions[0], du,
-        geometry.row_positions[0], dv, *beam.focal_spot, np.ascontiguousarray(beam.points), bodies.kinds, bodies.params,
-        coefficients, basis, bodies.offsets, bodies.drift, np.array(bodies.circle), reach,
-        np.ascontiguousarray(beam.spectra), np.ascontiguousarray(beam.row_factor), window.first_column,
-        window.first_row, empty if surround is None else np.ascontiguousarray(surround), out,
-    )  # fmt: skip
+        _readings,
+        geometry.views,
+        np.cos(geometry.angles),
+        np.sin(geometry.angles),
+        np.ascontiguousarray(view_step),
+        geometry.sod,
+        geometry.sdd,
+        geometry.detector == "curved",
+        geometry.column_positions[0],
+        du,
+        geometry.row_positions[0],
+        dv,
+        *beam.focal_spot,
+        np.ascontiguousarray(beam.points),
+        bodies.kinds,
+        bodies.params,
+        coefficients,
+        basis,
+        bodies.offsets,
+        bodies.drift,
+        np.array(bodies.circle),
+        reach,
+        np.ascontiguousarray(beam.spectra),
+        np.ascontiguousarray(beam.row_factor),
+        window.first_column,
+        window.first_row,
+        empty if surround is None else np.ascontiguousarray(surround),
+        out,
+    )
     return torch.from_numpy(out)
 
 

@@ -1,12 +1,15 @@
-"""Does every cell of the detector read what it should, where it should? Tests of columns that hold in all views.
+"""Does every cell of the detector read what it should, where it should? Tests of columns that hold
+in all views.
 
-No object but one that turns with the detector stays in a column: what a cell reads above or below its neighbours in the
-views of every part of the scan is its gain. What is round about the axis does stay; its shadow is the same on the other
-side of the axis, so what the mirrored place shows, too, is taken off. The cell on the axis is its own mirror image: a
-wire there and a gain of its cell are the same readings, and only a large deviation is named.
+No object but one that turns with the detector stays in a column: what a cell reads above or below
+its neighbours in the views of every part of the scan is its gain. What is round about the axis does
+stay; its shadow is the same on the other side of the axis, so what the mirrored place shows, too,
+is taken off. The cell on the axis is its own mirror image: a wire there and a gain of its cell are
+the same readings, and only a large deviation is named.
 
-Columns that alternate about their places (the order of two is exchanged, a readout that interleaves them wrongly) leave
-a residual that alternates from column to column and looks like the slope along the columns.
+Columns that alternate about their places (the order of two is exchanged, a readout that interleaves
+them wrongly) leave a residual that alternates from column to column and looks like the slope along
+the columns.
 """
 
 from __future__ import annotations
@@ -28,18 +31,22 @@ __all__ = ["GAIN_TOLERANCE", "column_test"]
 
 Floats = NDArray[np.float64]
 
-GAIN_TOLERANCE, AXIS_TOLERANCE = 0.03, 0.1
-"""Deviation of a cell's log signal from its neighbours' that is no finding; of the cell on the axis, where something
-thin may be."""
+GAIN_TOLERANCE = 0.03
+AXIS_TOLERANCE = 0.1
+"""Deviation of a cell's log signal from its neighbours' that is no finding; of the cell on the
+axis, where something thin may be."""
 PLACE_TOLERANCE = 0.25
 """Columns by which those of even and odd number may lie beside their places."""
-_FEWEST_COLUMNS, _FEWEST_VIEWS = 16, 32
+_FEWEST_COLUMNS = 16
+_FEWEST_VIEWS = 32
 _BLOCKS = 16
 _WIDTHS = (1, 2, 3)
 """Columns side by side that deviate alike."""
-_SIGMAS, _ALIKE, _CONSTANT = 8.0, 0.25, 0.3
-"""Standard errors from which a deviation is none of chance; share of it by which its neighbours may differ from half of
-it, the other way; and share of it that every part of the scan must show."""
+_SIGMAS = 8.0
+_ALIKE = 0.25
+_CONSTANT = 0.3
+"""Standard errors from which a deviation is none of chance; share of it by which its neighbours may
+differ from half of it, the other way; and share of it that every part of the scan must show."""
 
 
 @checked
@@ -51,9 +58,9 @@ def column_test(lines: Tensor, geometry: Geometry) -> ScanTest:
         geometry: parallel, fan or cone beam.
 
     Returns:
-        The test of ``gain`` (largest factor by which a cell reads more or less than its neighbours, less 1) and
-        ``place`` (columns by which those of even and odd number lie beside their places).
-        :data:`~torchpcct.checks.scan_test.UNKNOWN` of fewer than 16 columns or 32 views.
+        The test of ``gain`` (largest factor by which a cell reads more or less than its neighbours,
+        less 1) and ``place`` (columns by which those of even and odd number lie beside their
+        places). :data:`~torchpcct.checks.scan_test.UNKNOWN` of fewer than 16 columns or 32 views.
 
     Raises:
         ValueError: a wrong shape, NaN or Inf.
@@ -71,8 +78,10 @@ def column_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     findings = [gain_text] if gain_text else []
     if abs(place) - _SIGMAS * error > PLACE_TOLERANCE:
         findings.append(
-            f"the columns of even and of odd number lie about {abs(place):.1f} columns beside their places, to either "
-            f"side ({abs(place) / error:.0f} standard errors): neighbouring columns are exchanged, or interleaved the "
+            f"the columns of even and of odd number lie about {abs(place):.1f} columns beside "
+            "their places, to either "
+            f"side ({abs(place) / error:.0f} standard errors): neighbouring columns are "
+            "exchanged, or interleaved the "
             "wrong way; edges are torn; sort the columns"
         )
     return ScanTest({"gain": gain, "place": place}, {"place": error}, tuple(findings))
@@ -102,15 +111,27 @@ def _gain(blocks: Floats, g: Any) -> tuple[float, str]:
         excess = np.where(own, bend, bend - other)
         size = excess.mean(0)
         # Of the parts without the object's edges.
-        error = MEDIAN_TO_SD * np.median(np.abs(excess - np.median(excess, axis=0)), axis=0) / math.sqrt(_BLOCKS)
+        error = (
+            MEDIAN_TO_SD
+            * np.median(np.abs(excess - np.median(excess, axis=0)), axis=0)
+            / math.sqrt(_BLOCKS)
+        )
         usual = MEDIAN_TO_SD * np.median(np.abs(size), axis=-1, keepdims=True)
         tolerance = np.where(own, AXIS_TOLERANCE, GAIN_TOLERANCE)
         # An edge of the object may stand in the column in two parts of the scan.
         constant = np.partition(np.sign(size) * excess, 2, axis=0)[2] > _CONSTANT * np.abs(size)
-        wrong = (np.abs(size) > np.maximum(tolerance, _SIGMAS * np.maximum(error, usual))) & constant
-        # Far from the axis nothing alike may stand about the mirrored place: interpolation blurs thin walls.
-        sides = [np.sign(mean) * mean[..., np.clip(low + k, 0, bend.shape[-1] - 1)] for k in (-1, 0, 1, 2)]
-        alike = np.where(np.abs(centre) < 3.0 * width * step, 1.5 * np.abs(opposite), 3.0 * np.max(sides, axis=0))
+        wrong = (
+            np.abs(size) > np.maximum(tolerance, _SIGMAS * np.maximum(error, usual))
+        ) & constant
+        # Far from the axis nothing alike may stand about the mirrored place: interpolation blurs
+        # thin walls.
+        sides = [
+            np.sign(mean) * mean[..., np.clip(low + k, 0, bend.shape[-1] - 1)]
+            for k in (-1, 0, 1, 2)
+        ]
+        alike = np.where(
+            np.abs(centre) < 3.0 * width * step, 1.5 * np.abs(opposite), 3.0 * np.max(sides, axis=0)
+        )
         wrong &= np.abs(mean) > np.where(inside, alike, 0.0)
         # The neighbours of a wrong gain bend by half as much, the other way.
         left, right = (np.roll(mean, k, axis=-1) for k in (width, -width))
@@ -129,7 +150,9 @@ def _gain(blocks: Floats, g: Any) -> tuple[float, str]:
     return largest, text
 
 
-def _gain_text(wrong: NDArray[np.bool_], row: int, column: int, width: int, size: float, error: float, g: Any) -> str:
+def _gain_text(
+    wrong: NDArray[np.bool_], row: int, column: int, width: int, size: float, error: float, g: Any
+) -> str:
     many = int(wrong.sum()) - 1
     what = f"column {column}" if width == 1 else f"columns {column} … {column + width - 1}"
     if isinstance(g, ConeBeam) and wrong[:, column - width].mean() < 0.5:
@@ -137,27 +160,33 @@ def _gain_text(wrong: NDArray[np.bool_], row: int, column: int, width: int, size
     more = f" (and {many} more)" if many > 0 and not isinstance(g, ConeBeam) else ""
     reads = "reads" if width == 1 else "read"
     return (
-        f"{what}{more} {reads} {1.0 + size:.3g} ± {error * (1.0 + size):.1g} times what its neighbours do, in all "
+        f"{what}{more} {reads} {1.0 + size:.3g} ± {error * (1.0 + size):.1g} times what its "
+        "neighbours do, in all "
         "views: a wrong gain, which draws a ring; measure air again, or mask it (dead=)"
     )
 
 
 def _place(lines: Tensor, g: Any) -> tuple[float, float]:
-    """Shift of the columns that alternates, in columns, and its error from the scatter of blocks of views."""
+    """Shift of the columns that alternates, in columns, and its error from the scatter of blocks
+    of views."""
     rows = lines.detach().reshape(g.views, -1, g.columns)
     rows = rows[:, :: max(1, rows.shape[1] // 8)]
     rows = rows[:: max(1, rows.numel() // 4_000_000)]
     p = rows.to("cpu", torch.float64).numpy()
     p = p - p.mean(0)  # edges of what is round stay in their columns, and say nothing of these
-    # Over an even distance, which an exchange of neighbours keeps; of readings that the bend does not hold.
+    # Over an even distance, which an exchange of neighbours keeps; of readings that the bend does
+    # not hold.
     slope = (p[..., 8:] - p[..., :-8]) / 8.0
     bend = p[..., 4:-4] - (p[..., 5:-3] + p[..., 3:-5]) / 2.0
     sign = 1.0 - 2.0 * (np.arange(bend.shape[-1]) % 2)
     score = (sign * bend * slope).sum((1, 2))
-    power = (slope[..., 1:] * slope[..., :-1]).sum((1, 2))  # next to each other they share no reading
+    # next to each other they share no reading
+    power = (slope[..., 1:] * slope[..., :-1]).sum((1, 2))
     total = float(power.sum())
     if len(p) < _BLOCKS or total <= 0.0 or g.columns < 2 * _FEWEST_COLUMNS:
         return 0.0, math.inf
     parts = np.array([score[b].sum() for b in np.array_split(np.arange(len(p)), _BLOCKS)])
     # A shift by ε to either side bends by 2 ε slopes.
-    return float(parts.sum()) / (2.0 * total), float(parts.std(ddof=1)) * math.sqrt(_BLOCKS) / (2.0 * total)
+    return float(parts.sum()) / (2.0 * total), float(parts.std(ddof=1)) * math.sqrt(_BLOCKS) / (
+        2.0 * total
+    )

@@ -1,4 +1,5 @@
-"""CPU kernels of the search for defects: sums over the views of what each detector cell has read."""
+"""CPU kernels of the search for defects: sums over the views of what each detector cell has
+read."""
 
 from __future__ import annotations
 
@@ -33,7 +34,8 @@ def levels(begin, end, counts, first, views, seen, dark, bright):
 
 @njit(nogil=True, cache=True)
 def bends(begin, end, counts, first, views, dead, above, times):
-    """Add how far the log of every cell lies above the mean of its neighbours', and how often all three were good.
+    """Add how far the log of every cell lies above the mean of its neighbours', and how often all
+    three were good.
 
     Args:
         counts, first, views: as in :func:`levels`.

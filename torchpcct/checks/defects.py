@@ -1,9 +1,11 @@
-"""Impossible readings (dead and hot cells, dead columns and views, lost readings): found, masked, interpolated.
+"""Impossible readings (dead and hot cells, dead columns and views, lost readings): found, masked,
+interpolated.
 
-A reading of 0 where hundreds are expected has the logarithm of a ray through lead, and FBP draws it as a streak or a
-ring of thousands of HU. It cannot be noise: the Poisson probability of 0 at an expectation of 30 is 1e-13. Metal can
-darken rays down to 0, too, but its footprint has edges: the cells beside it dim before it reaches them, it walks over
-the columns from view to view, and it neither comes nor goes from one view to the next.
+A reading of 0 where hundreds are expected has the logarithm of a ray through lead, and FBP draws it
+as a streak or a ring of thousands of HU. It cannot be noise: the Poisson probability of 0 at an
+expectation of 30 is 1e-13. Metal can darken rays down to 0, too, but its footprint has edges: the
+cells beside it dim before it reaches them, it walks over the columns from view to view, and it
+neither comes nor goes from one view to the next.
 """
 
 from __future__ import annotations
@@ -22,33 +24,46 @@ from torchpcct.scan import Scan
 from torchpcct.threads import run
 from torchpcct.validate import shaped
 
-__all__ = ["Cells", "Defects", "cell_sums", "dark_views", "dead_readings", "find_defects", "is_repaired",
-           "photon_and_light", "repair_defects", "wrong_cells"]  # fmt: skip
+__all__ = [
+    "Cells",
+    "Defects",
+    "cell_sums",
+    "dark_views",
+    "dead_readings",
+    "find_defects",
+    "is_repaired",
+    "photon_and_light",
+    "repair_defects",
+    "wrong_cells",
+]
 
 BRIGHT = 30.0
 """Expected readings from which 0 cannot be noise (probability 1e-13)."""
 GAIN_ERROR = 0.1
-"""Deviation of a cell's mean log signal from its neighbours' from which its gain is taken as wrong; the calibration in
-air of a good detector leaves 0.001."""
+"""Deviation of a cell's mean log signal from its neighbours' from which its gain is taken as wrong;
+the calibration in air of a good detector leaves 0.001."""
 _NEIGHBOURS = 4
 # Share of single lost readings from which zeros up to three wide are taken for lost, too.
 _FREQUENT = 0.005
 _SIGMAS = 8.0
-_TOGETHER, _BENT, _ABOUT = 2, 0.25, 5
-"""Most cells of a wrong gain side by side; the bend beside them, over their error, that is no outline; and the columns
-to either side in which outlines are looked for."""
+_TOGETHER = 2
+_BENT = 0.25
+_ABOUT = 5
+"""Most cells of a wrong gain side by side; the bend beside them, over their error, that is no
+outline; and the columns to either side in which outlines are looked for."""
 _MIRRORED = 0.25
 """What deviates on the other side by that share, up to its inverse, is an outline."""
 _LASTING = 3
-"""Views from which a cell that reads 0 without a break is dead for part of the turn, and not a lost reading."""
+"""Views from which a cell that reads 0 without a break is dead for part of the turn, and not a
+lost reading."""
 _WIDTH = 6
 """Most cells side by side that are lost together."""
 _DIMMED = 0.1
-"""Step of the logarithm of the mean reading over all views, from the second to the first cell beside a footprint that
-turns about the axis, on both sides."""
+"""Step of the logarithm of the mean reading over all views, from the second to the first cell
+beside a footprint that turns about the axis, on both sides."""
 _DIP = 1.0
-"""Step of the logarithm from the second to the first cell beside a footprint, on both sides: what blur and the thin
-edge of an opaque body leave. A bright detail three cells wide has 0.6."""
+"""Step of the logarithm from the second to the first cell beside a footprint, on both sides: what
+blur and the thin edge of an opaque body leave. A bright detail three cells wide has 0.6."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +72,8 @@ class Defects:
 
     Attributes:
         mask: ``(views, rows, columns)`` bool, True where a reading must not be used.
-        dead_cells, hot_cells, dead_views, lost_readings: how many of each were found; lost readings are single ones
-            beside the others.
+        dead_cells, hot_cells, dead_views, lost_readings: how many of each were found; lost readings
+            are single ones beside the others.
         dead_for_a_while: cells that were dead for part of the views.
     """
 
@@ -81,7 +96,11 @@ class Defects:
         )
         found = ", ".join(f"{n} {what}" for n, what in parts if n)
         share = 100 * float(self.mask.float().mean())
-        return f"{found}: {share:.2g} % of the readings were interpolated from their neighbours" if found else ""
+        return (
+            f"{found}: {share:.2g} % of the readings were interpolated from their neighbours"
+            if found
+            else ""
+        )
 
 
 def find_defects(
@@ -97,36 +116,45 @@ def find_defects(
     """Find readings that no object can cause.
 
     * a view in which 99 % of the readings are 0, while others are not;
-    * a detector cell that reads 0 in (nearly) all of its views, while the cells beside it are bright (more than 30
-      photons) and not dimmed;
-    * a cell that reads 0 for some views, alone or with up to five others, between bright cells that are not dimmed, and
-      is bright just before and after;
+    * a detector cell that reads 0 in (nearly) all of its views, while the cells beside it are
+      bright (more than 30 photons) and not dimmed;
+    * a cell that reads 0 for some views, alone or with up to five others, between bright cells that
+      are not dimmed, and is bright just before and after;
     * a single 0 with bright readings on both sides;
-    * a cell whose log signal lies above or below the mean of its neighbours by 10 % and eight standard errors more than
-      that of the other rows (three or more) does.
+    * a cell whose log signal lies above or below the mean of its neighbours by 10 % and eight
+      standard errors more than that of the other rows (three or more) does.
 
     Args:
-        counts: ``(views, rows, columns)`` noisy readings, the dark taken off: 0 or less is no signal.
+        counts: ``(views, rows, columns)`` noisy readings, the dark taken off: 0 or less is no
+            signal.
         air: ``(rows, detector columns)`` expected readings without the object.
-        first_column: ``(views,)`` detector column of the first reading of each view (a window); None: 0.
-        known: bool, the shape of ``counts``: readings that are known to be dead, which are not found again.
+        first_column: ``(views,)`` detector column of the first reading of each view (a window);
+            None: 0.
+        known: bool, the shape of ``counts``: readings that are known to be dead, which are not
+            found again.
         photon: reading of one photon.
         electronic_noise: standard deviation that the electronics add to a reading.
-        cells: of some rows of a detector, what all of them say of these cells and of the views; None: found here.
+        cells: of some rows of a detector, what all of them say of these cells and of the views;
+            None: found here.
 
     Raises:
         ValueError: shapes that do not fit.
     """
     if counts.ndim != 3 or air.ndim != 2 or air.shape[0] != counts.shape[1]:
         raise ValueError(
-            f"counts must be (views, rows, columns) and air (rows, detector columns), got {tuple(counts.shape)} and "
+            "counts must be (views, rows, columns) and air (rows, detector columns), got "
+            f"{tuple(counts.shape)} and "
             f"{tuple(air.shape)}"
         )
     n = counts.detach().cpu().numpy()
     views, _, columns = n.shape
-    first: Any = np.zeros(views, np.int64) if first_column is None else np.asarray(first_column, np.int64)
+    first: Any = (
+        np.zeros(views, np.int64) if first_column is None else np.asarray(first_column, np.int64)
+    )
     if first.shape != (views,) or first.min() < 0 or first.max() + columns > air.shape[1]:
-        raise ValueError(f"first_column must hold {views} columns of a detector with {air.shape[1]}")
+        raise ValueError(
+            f"first_column must hold {views} columns of a detector with {air.shape[1]}"
+        )
     light = BRIGHT * photon + _SIGMAS * electronic_noise
     zero = n <= 0
     parts = [np.s_[:, c : c + columns] for c in first]
@@ -143,7 +171,10 @@ def find_defects(
         for part, those in zip(parts, new, strict=True):
             fresh[part] |= those
         dead, hot, view_dead = dead & fresh, hot & fresh, view_dead & new.any((1, 2))
-    mask = np.stack([lost | (dead | hot)[part] for lost, part in zip(view_dead, parts, strict=True)]) & new
+    mask = (
+        np.stack([lost | (dead | hot)[part] for lost, part in zip(view_dead, parts, strict=True)])
+        & new
+    )
     zero &= new & ~mask
     at = np.argwhere(zero) if zero.any() else np.zeros((0, 3), np.int64)
     # Without the dead views, which nobody is the neighbour of.
@@ -153,12 +184,18 @@ def find_defects(
     single[:, 0] = alive[single[:, 0]]
     mask[tuple(single.T)] = True
     return Defects(
-        torch.from_numpy(mask), int(dead.sum()), int(hot.sum()), int(view_dead.sum()), len(single) - lasting, resting
+        torch.from_numpy(mask),
+        int(dead.sum()),
+        int(hot.sum()),
+        int(view_dead.sum()),
+        len(single) - lasting,
+        resting,
     )
 
 
 class Cells(NamedTuple):
-    """Views without signal ``(views,)``, dead cells and cells of a wrong gain ``(rows, detector columns)``, bool."""
+    """Views without signal ``(views,)``, dead cells and cells of a wrong gain ``(rows, detector
+    columns)``, bool."""
 
     views: NDArray[np.bool_]
     dead: NDArray[np.bool_]
@@ -171,8 +208,11 @@ def dark_views(share: NDArray[np.float64]) -> NDArray[np.bool_]:
     return dark & ~dark.all()
 
 
-def cell_sums(n: Any, air: Tensor, first: Any, lost: NDArray[np.bool_], light: float) -> NDArray[np.float64]:
-    """What the readings of every cell add up to over the views that have a signal, row by row for itself.
+def cell_sums(
+    n: Any, air: Tensor, first: Any, lost: NDArray[np.bool_], light: float
+) -> NDArray[np.float64]:
+    """What the readings of every cell add up to over the views that have a signal, row by row for
+    itself.
 
     Args:
         n: readings ``(views, rows, columns)``.
@@ -182,8 +222,9 @@ def cell_sums(n: Any, air: Tensor, first: Any, lost: NDArray[np.bool_], light: f
         light: readings from which 0 cannot be noise.
 
     Returns:
-        ``(5, rows, detector columns)``: how often each was read, and 0; the sum of its readings; how far its log signal
-        lies above the mean of its neighbours', summed over the views in which both are good, and how many those are.
+        ``(5, rows, detector columns)``: how often each was read, and 0; the sum of its readings;
+        how far its log signal lies above the mean of its neighbours', summed over the views in
+        which both are good, and how many those are.
     """
     from torchpcct.checks.defect_kernels import bends, levels  # numba loads with its first use
 
@@ -193,13 +234,25 @@ def cell_sums(n: Any, air: Tensor, first: Any, lost: NDArray[np.bool_], light: f
     shaped("first", first, (len(n),))
     shaped("lost", lost, (len(n),))
     if first.size and (first.min() < 0 or first.max() + n.shape[2] > air.shape[1]):
-        raise ValueError(f"first must be columns of a detector of {air.shape[1]}, {n.shape[2]} of which are read")
+        raise ValueError(
+            f"first must be columns of a detector of {air.shape[1]}, {n.shape[2]} of which are read"
+        )
     sums = np.zeros((5, *air.shape))
     seen, dark, bright, above, times = sums
     run(levels, rows, n, first, alive, seen, dark, bright, operations=3 * alive.size * n.shape[2])
     if rows >= 3:
         dead = _dead_cells(sums, light)
-        run(bends, rows, n, first, alive, dead, above, times, operations=20 * alive.size * n.shape[2])
+        run(
+            bends,
+            rows,
+            n,
+            first,
+            alive,
+            dead,
+            above,
+            times,
+            operations=20 * alive.size * n.shape[2],
+        )
         # The air's own share, which no view changes.
         reference = np.log(air.detach().cpu().to(torch.float64).numpy())
         expected = reference[:, 1:-1] - (reference[:, :-2] + reference[:, 2:]) / 2
@@ -216,12 +269,17 @@ def _dead_cells(sums: NDArray[np.float64], light: float) -> NDArray[np.bool_]:
     # Of a dead row the neighbours are in other rows.
     dead &= np.fmax(_beside(good_level), _beside(good_level.T).T) > light
     along = _dimmed(good_level, dead)
-    dead &= ~np.where(np.isnan(along), np.nan_to_num(_dimmed(good_level.T, dead.T).T), along).astype(bool)
+    dead &= ~np.where(
+        np.isnan(along), np.nan_to_num(_dimmed(good_level.T, dead.T).T), along
+    ).astype(bool)
     return dead
 
 
-def wrong_cells(sums: NDArray[np.float64], lost: NDArray[np.bool_], photon: float, light: float) -> Cells:
-    """Cells that are dead or of a wrong gain, by :func:`cell_sums` of all rows; see :func:`find_defects`."""
+def wrong_cells(
+    sums: NDArray[np.float64], lost: NDArray[np.bool_], photon: float, light: float
+) -> Cells:
+    """Cells that are dead or of a wrong gain, by :func:`cell_sums` of all rows; see
+    :func:`find_defects`."""
     dead = _dead_cells(sums, light)
     hot = np.zeros_like(dead)
     if sums.shape[1] >= 3:
@@ -237,12 +295,16 @@ def wrong_cells(sums: NDArray[np.float64], lost: NDArray[np.bool_], photon: floa
     return Cells(lost, dead, hot)
 
 
-def _alone(deviation: NDArray[np.float64], found: NDArray[np.bool_], known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Those cells of a wrong gain that stand out of a smooth row, up to :data:`_TOGETHER` side by side.
+def _alone(
+    deviation: NDArray[np.float64], found: NDArray[np.bool_], known: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Those cells of a wrong gain that stand out of a smooth row, up to :data:`_TOGETHER` side by
+    side.
 
-    The outline of a body that is round about the axis stays on its cells, too, and on others in every row: many of the
-    cells about one of its own deviate, and so does one on the other side. Gains are gone once their cells
-    are bridged: those beside them then lie on a line with the next. An outline bends the row wherever it is bridged.
+    The outline of a body that is round about the axis stays on its cells, too, and on others in
+    every row: many of the cells about one of its own deviate, and so does one on the other side.
+    Gains are gone once their cells are bridged: those beside them then lie on a line with the next.
+    An outline bends the row wherever it is bridged.
 
     Args:
         deviation: how far cells lie above the mean of their neighbours in the row.
@@ -280,7 +342,8 @@ def _alone(deviation: NDArray[np.float64], found: NDArray[np.bool_], known: NDAr
 
 
 def _mirrored(deviation: NDArray[np.float64], row: int, column: int) -> bool:
-    """Whether a cell deviates about as much on the other side of the axis, or of the plane of the source.
+    """Whether a cell deviates about as much on the other side of the axis, or of the plane of the
+    source.
 
     Neither is far from the middle of the detector.
     """
@@ -296,7 +359,8 @@ def _mirrored(deviation: NDArray[np.float64], row: int, column: int) -> bool:
 
 
 def _beside(cells: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Median of the cells up to four places beside each on the last axis, NaN left out; NaN where there is none."""
+    """Median of the cells up to four places beside each on the last axis, NaN left out; NaN
+    where there is none."""
     padded = np.pad(cells, ((0, 0), (_NEIGHBOURS, _NEIGHBOURS)), constant_values=np.nan)
     width = cells.shape[1]
     shifts = [padded[:, k : k + width] for k in range(2 * _NEIGHBOURS + 1) if k != _NEIGHBOURS]
@@ -305,7 +369,8 @@ def _beside(cells: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _dimmed(level: NDArray[np.float64], dead: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Whether the live cells next to each dead one on the last axis are dimmed on both sides: 1 or 0, NaN: unknown.
+    """Whether the live cells next to each dead one on the last axis are dimmed on both sides: 1 or
+    0, NaN: unknown.
 
     Args:
         level: mean readings, NaN where there are none.
@@ -317,8 +382,10 @@ def _dimmed(level: NDArray[np.float64], dead: NDArray[np.bool_]) -> NDArray[np.f
         right = np.searchsorted(live, at)
         known = (right > 1) & (right < live.size - 1)
         at, right = at[known], right[known]
-        sides = [np.log(np.maximum(level[r, live[far]], 1e-9) / np.maximum(level[r, live[near]], 1e-9))
-                 for near, far in ((right - 1, right - 2), (right, right + 1))]  # fmt: skip
+        sides = [
+            np.log(np.maximum(level[r, live[far]], 1e-9) / np.maximum(level[r, live[near]], 1e-9))
+            for near, far in ((right - 1, right - 2), (right, right + 1))
+        ]
         found[r, at] = np.min(sides, axis=0) > _DIMMED
     return found
 
@@ -326,8 +393,9 @@ def _dimmed(level: NDArray[np.float64], dead: NDArray[np.bool_]) -> NDArray[np.f
 def _isolated(
     n: NDArray[Any], at: NDArray[np.int64], first: NDArray[np.int64], light: float, reach: int = 1
 ) -> NDArray[np.int64]:
-    """Those of the zeros ``at`` ``(k, 3)`` whose non-zero neighbours in the row and the next rows are bright on both
-    sides; and not both dim in the rows, or the views, beside: a detail as narrow as a cell goes on there."""
+    """Those of the zeros ``at`` ``(k, 3)`` whose non-zero neighbours in the row and the next rows
+    are bright on both sides; and not both dim in the rows, or the views, beside: a detail as narrow
+    as a cell goes on there."""
     values = [[_around(n, at, side * dc) for dc in range(1, reach + 1)] for side in (-1, 1)]
     stacked = np.ma.masked_less_equal(np.stack([np.concatenate(v) for v in values]), 0.0)
     sides = np.ma.filled(np.ma.median(stacked, axis=1), 0.0)
@@ -342,7 +410,8 @@ def _isolated(
 
 
 def _dim_rows(n: NDArray[Any], at: NDArray[np.int64], light: float) -> NDArray[np.bool_]:
-    """Whether the zeros ``at`` have only dim neighbours in the rows beside, as an upright detail has."""
+    """Whether the zeros ``at`` have only dim neighbours in the rows beside, as an upright detail
+    has."""
     if n.shape[1] == 1:
         return np.zeros(len(at), bool)
     return _dim(_around(n, at, 0)[[0, 2]], light)
@@ -354,8 +423,8 @@ def _dim(pair: NDArray[Any], light: float) -> NDArray[np.bool_]:
 
 
 def _around(n: NDArray[Any], at: NDArray[np.int64], column: Any, view: Any = 0) -> NDArray[Any]:
-    """The readings ``column`` columns (and ``view`` views) from ``at``, in the same row and the next ones: ``(1 | 3,
-    k)``; 0 beyond the detector, NaN beyond the first and the last view."""
+    """The readings ``column`` columns (and ``view`` views) from ``at``, in the same row and the
+    next ones: ``(1 | 3, k)``; 0 beyond the detector, NaN beyond the first and the last view."""
     limits = np.array(n.shape) - 1
     values = []
     for dr in (-1, 0, 1) if n.shape[1] > 1 else (0,):
@@ -367,8 +436,11 @@ def _around(n: NDArray[Any], at: NDArray[np.int64], column: Any, view: Any = 0) 
     return np.stack(values)
 
 
-def _company(n: NDArray[Any], at: NDArray[np.int64], first: NDArray[np.int64], step: int, apart: int) -> NDArray[Any]:
-    """Whether the view ``step`` from the zeros ``at`` has one within ``apart`` columns, too; True beyond the scan."""
+def _company(
+    n: NDArray[Any], at: NDArray[np.int64], first: NDArray[np.int64], step: int, apart: int
+) -> NDArray[Any]:
+    """Whether the view ``step`` from the zeros ``at`` has one within ``apart`` columns, too;
+    True beyond the scan."""
     there = np.clip(at[:, 0] + step, 0, len(n) - 1)
     drift = first[at[:, 0]] - first[there]
     found = (at[:, 0] + step < 0) | (at[:, 0] + step >= len(n))
@@ -382,8 +454,8 @@ def _company(n: NDArray[Any], at: NDArray[np.int64], first: NDArray[np.int64], s
 def _unshadowed(
     n: NDArray[Any], at: NDArray[np.int64], first: NDArray[np.int64], columns: int, light: float
 ) -> tuple[NDArray[np.int64], int, int]:
-    """Those of the zeros ``at`` ``(k, 3)`` that are no footprint; how many of them are of cells that were dead for a
-    while, and how many cells those are.
+    """Those of the zeros ``at`` ``(k, 3)`` that are no footprint; how many of them are of cells
+    that were dead for a while, and how many cells those are.
 
     Args:
         n: of the views that have a signal.
@@ -395,13 +467,19 @@ def _unshadowed(
     moving = math.ceil(math.pi * columns / len(n))
     single = _isolated(n, at, first, light)
     if len(single) > _FREQUENT * n.size:
-        # So many are no accident, unless they follow each other: neighbours on one side are often lost together.
-        follow = np.mean(_company(n, single, first, -1, moving) & _company(n, single, first, 1, moving))
+        # So many are no accident, unless they follow each other: neighbours on one side are often
+        # lost together.
+        follow = np.mean(
+            _company(n, single, first, -1, moving) & _company(n, single, first, 1, moving)
+        )
         chance = (1 - (1 - np.mean(n <= 0)) ** (2 * moving + 1)) ** 2
         if follow < chance + 0.25:
-            lost = np.unique(np.concatenate([single, _isolated(n, at, first, light, reach=3)]), axis=0)
+            lost = np.unique(
+                np.concatenate([single, _isolated(n, at, first, light, reach=3)]), axis=0
+            )
             return lost, 0, 0
-    # Cells of the detector, one after the other, each view by view: what follows without a break is one run.
+    # Cells of the detector, one after the other, each view by view: what follows without a break is
+    # one run.
     cell = at[:, 2] + first[at[:, 0]]
     order = np.lexsort((at[:, 0], cell, at[:, 1]))
     at, cell = at[order], cell[order]
@@ -412,7 +490,10 @@ def _unshadowed(
     lengths = np.diff(np.append(starts, len(at)))
     reach, near, far = zip(*(_flank(n, at, side) for side in (-1, 1)), strict=True)
     distance = np.stack(reach)
-    dip = np.min([np.log(np.maximum(f, 0.5) / np.maximum(v, 0.5)) for f, v in zip(far, near, strict=True)], axis=0)
+    dip = np.min(
+        [np.log(np.maximum(f, 0.5) / np.maximum(v, 0.5)) for f, v in zip(far, near, strict=True)],
+        axis=0,
+    )
 
     def share(values: NDArray[Any]) -> NDArray[Any]:
         return np.add.reduceat(values.astype(np.float64), starts) / lengths
@@ -424,13 +505,15 @@ def _unshadowed(
     narrow = distance[:, middle].sum(0) - 1 <= _WIDTH
     upright = share(_dim_rows(n, at, light)) >= 0.5
     good = narrow & ~upright & (share(lit) >= 0.75) & (share(still) >= 0.75) & (share(dip) <= _DIP)
-    # Before and after: as bright as its neighbours then, and no footprint has come from elsewhere and gone elsewhere.
+    # Before and after: as bright as its neighbours then, and no footprint has come from elsewhere
+    # and gone elsewhere.
     moved, tested = np.ones(len(starts), bool), np.zeros(len(starts), bool)
     for step, place in ((-1, starts), (1, starts + lengths - 1)):
         p = at[place]
         drift = first[p[:, 0]] - first[np.clip(p[:, 0] + step, 0, len(n) - 1)]
         own, left, right = (
-            _middle(_around(n, p, d + drift, step)) for d in (0, -distance[0, middle], distance[1, middle])
+            _middle(_around(n, p, d + drift, step))
+            for d in (0, -distance[0, middle], distance[1, middle])
         )
         inside = np.isfinite(own)
         beside = np.minimum(np.where(left > 0, left, np.inf), np.where(right > 0, right, np.inf))
@@ -444,15 +527,21 @@ def _unshadowed(
 
 
 def _middle(values: NDArray[Any]) -> NDArray[Any]:
-    """Median of the bright ones of ``(k, places)`` at each place, 0 where there is none; NaN stays."""
+    """Median of the bright ones of ``(k, places)`` at each place, 0 where there is none; NaN
+    stays."""
     if len(values) == 1:
         return np.asarray(values[0])
-    found = np.ma.filled(np.ma.median(np.ma.masked_less_equal(np.nan_to_num(values), 0.0), axis=0), 0.0)
+    found = np.ma.filled(
+        np.ma.median(np.ma.masked_less_equal(np.nan_to_num(values), 0.0), axis=0), 0.0
+    )
     return np.where(np.isnan(values[1]), np.nan, found)
 
 
-def _flank(n: NDArray[Any], at: NDArray[np.int64], side: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """The first reading above 0 on one side of the zeros ``at``: how many columns away (0: none near), it, the next."""
+def _flank(
+    n: NDArray[Any], at: NDArray[np.int64], side: int
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """The first reading above 0 on one side of the zeros ``at``: how many columns away (0: none
+    near), it, the next."""
     distance = np.zeros(len(at), np.int64)
     near, far = np.zeros(len(at)), np.zeros(len(at))
     for d in range(1, _WIDTH + 3):
@@ -465,7 +554,8 @@ def _flank(n: NDArray[Any], at: NDArray[np.int64], side: int) -> tuple[NDArray[A
 
 
 def is_repaired(scan: Scan) -> bool:
-    """Whether :func:`repair_defects` looks at a scan: at noisy readings of a known noise, without energy bins."""
+    """Whether :func:`repair_defects` looks at a scan: at noisy readings of a known noise,
+    without energy bins."""
     noisy = not (scan.noise_free or scan.logged)
     return noisy and scan.counts.ndim <= 3 and (scan.quantum is not None or scan.counting)
 
@@ -473,32 +563,42 @@ def is_repaired(scan: Scan) -> bool:
 def photon_and_light(scan: Scan) -> tuple[float, float]:
     """Reading of one photon, and readings from which 0 cannot be noise."""
     photon = 1.0 if scan.quantum is None else float(scan.quantum.median())
-    photon = max(photon, dispersion(scan.counts, scan.geometry.has_rows)) if scan.window is None else photon
+    photon = (
+        max(photon, dispersion(scan.counts, scan.geometry.has_rows))
+        if scan.window is None
+        else photon
+    )
     return photon, BRIGHT * photon + _SIGMAS * scan.electronic_noise
 
 
-def repair_defects(scan: Scan, cells: Cells | None = None, photon: float | None = None) -> tuple[Scan, list[str]]:
+def repair_defects(
+    scan: Scan, cells: Cells | None = None, photon: float | None = None
+) -> tuple[Scan, list[str]]:
     """A scan whose impossible readings are bridged by their neighbours, and what was done.
 
-    Of a scan without window they are dead from then on (``scan.dead``): they weigh nothing. In views of which more is
-    lost than :data:`torchpcct.readings.MOST_DEAD`, and in scans with a window, they are replaced by the counts that
-    the interpolated line integrals stand for, which are less noisy than those lost.
+    Of a scan without window they are dead from then on (``scan.dead``): they weigh nothing. In
+    views of which more is lost than :data:`torchpcct.readings.MOST_DEAD`, and in scans with a
+    window, they are replaced by the counts that the interpolated line integrals stand for, which
+    are less noisy than those lost.
 
     Args:
-        scan: noisy readings of any geometry, of several slices or one; other scans (noise-free ones, line integrals,
-            energy bins) are returned as they are.
-        cells, photon: of :func:`find_defects`, where they are known of more rows than these; None: found here.
+        scan: noisy readings of any geometry, of several slices or one; other scans (noise-free
+            ones, line integrals, energy bins) are returned as they are.
+        cells, photon: of :func:`find_defects`, where they are known of more rows than these; None:
+            found here.
 
     Returns:
-        The scan (the same object if nothing was found), its ``info`` with the number of ``dead_readings``; and one
-        sentence for what was found now or at an earlier call.
+        The scan (the same object if nothing was found), its ``info`` with the number of
+        ``dead_readings``; and one sentence for what was found now or at an earlier call.
     """
     g = scan.geometry
     before = list(scan.info.get("repaired", scan.info.get("mended", [])))  # its former name
     if not is_repaired(scan):
         return scan, before
     window, dead = scan.window, scan.dead
-    air = scan.air if window is None else scan.air[window.first_row : window.first_row + window.rows]
+    air = (
+        scan.air if window is None else scan.air[window.first_row : window.first_row + window.rows]
+    )
     options: dict[str, Any] = {
         "photon": photon_and_light(scan)[0] if photon is None else photon,
         "electronic_noise": scan.electronic_noise,
@@ -511,13 +611,19 @@ def repair_defects(scan: Scan, cells: Cells | None = None, photon: float | None 
         # Slices of a stack need not be neighbours.
         counts, beam = scan.counts.reshape(-1, g.views, 1, g.columns), air.reshape(-1, 1, g.columns)
         known = [None] * len(counts) if dead is None else list(dead.reshape(counts.shape))
-        slices = [find_defects(n, a, known=k, **options) for n, a, k in zip(counts, beam, known, strict=True)]
+        slices = [
+            find_defects(n, a, known=k, **options)
+            for n, a, k in zip(counts, beam, known, strict=True)
+        ]
         mask = torch.stack([f.mask for f in slices]).reshape(scan.counts.shape)
         found = Defects(
-            mask, sum(f.dead_cells for f in slices), sum(f.hot_cells for f in slices),
-            max(f.dead_views for f in slices), sum(f.lost_readings for f in slices),
+            mask,
+            sum(f.dead_cells for f in slices),
+            sum(f.hot_cells for f in slices),
+            max(f.dead_views for f in slices),
+            sum(f.lost_readings for f in slices),
             sum(f.dead_for_a_while for f in slices),
-        )  # fmt: skip
+        )
     if not found.text:
         return scan, before
     dead = mask if scan.dead is None else mask | scan.dead
@@ -529,9 +635,13 @@ def repair_defects(scan: Scan, cells: Cells | None = None, photon: float | None 
     if window is None:
         axes = (-2, -1) if g.has_rows else (-1,)
         few = dead.float().mean(axes, keepdim=True) <= MOST_DEAD
-        changes["dead"] = (mask & few) | (torch.zeros_like(mask) if scan.dead is None else scan.dead)
+        changes["dead"] = (mask & few) | (
+            torch.zeros_like(mask) if scan.dead is None else scan.dead
+        )
     texts = [*before, found.text]
-    return replace(scan, **changes, info={**scan.info, "repaired": texts, "dead_readings": int(dead.sum())}), texts
+    return replace(
+        scan, **changes, info={**scan.info, "repaired": texts, "dead_readings": int(dead.sum())}
+    ), texts
 
 
 def dead_readings(scan: Scan) -> int:

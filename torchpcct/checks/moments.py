@@ -1,18 +1,22 @@
-"""Are the readings line integrals of one object? The first moments of Helgason and Ludwig, which need no image.
+"""Are the readings line integrals of one object? The first moments of Helgason and Ludwig, which
+need no image.
 
-Of parallel rays of the direction θ at the distances t, the sum ∫ p dt is the object's whole attenuation, the same for
-all θ; ∫ t p dt is a sinusoid, that of the centre of mass, and ∫ t² p dt one of twice the frequency and a constant
-(Helgason 1965, Ludwig 1966, Comm. Pure Appl. Math. 19:49). A fan's rays are sorted into parallel ones first.
+Of parallel rays of the direction θ at the distances t, the sum ∫ p dt is the object's whole
+attenuation, the same for all θ; ∫ t p dt is a sinusoid, that of the centre of mass, and ∫ t² p dt
+one of twice the frequency and a constant (Helgason 1965, Ludwig 1966, Comm. Pure Appl. Math.
+19:49). A fan's rays are sorted into parallel ones first.
 
-Of a cone beam the sum of a row over its columns tells, too, whether the object rises or sinks during the turn.
+Of a cone beam the sum of a row over its columns tells, too, whether the object rises or sinks
+during the turn.
 
-The sum tells what opposite rays cannot, since it happens to both alike: readings that are no logarithm of the
-transmission (pile-up, saturation, scatter, a dark signal, beam hardening) lack more where the path is long, so a body
-that is not round weighs less along its long axis. The frequency of the others tells the range of the angles, of a half
-turn, too.
+The sum tells what opposite rays cannot, since it happens to both alike: readings that are no
+logarithm of the transmission (pile-up, saturation, scatter, a dark signal, beam hardening) lack
+more where the path is long, so a body that is not round weighs less along its long axis. The
+frequency of the others tells the range of the angles, of a half turn, too.
 
-What the moments cannot show: the same errors in a round body; and of any body a wrong attenuation of water, a wrong
-length of the pitch, and gain errors of single columns, which both directions share.
+What the moments cannot show: the same errors in a round body; and of any body a wrong attenuation
+of water, a wrong length of the pitch, and gain errors of single columns, which both directions
+share.
 """
 
 from __future__ import annotations
@@ -32,44 +36,51 @@ from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
 __all__ = ["STEP_TOLERANCE", "WEIGHT_TOLERANCE", "moment_test"]
 
 WEIGHT_TOLERANCE = 0.002
-"""Root mean square of the sum's relative change with the direction that is no finding: 0.3 % of a thorax are some 20 HU
-(pile-up of 10 %), 0.1 % of it come from its bones at 100 kVp."""
+"""Root mean square of the sum's relative change with the direction that is no finding: 0.3 % of a
+thorax are some 20 HU (pile-up of 10 %), 0.1 % of it come from its bones at 100 kVp."""
 STEP_TOLERANCE = 0.005
 """Relative error of the steps between views that the moments of a sound scan may show."""
-CENTRE_CELLS, CENTRE_RADII = 0.3, 0.005
-"""Deviation of the centre of mass from its sinusoid that is no finding, root mean square: in cells at the axis, and in
-radii of the object (0.2 % from the bones of a thorax)."""
+CENTRE_CELLS = 0.3
+CENTRE_RADII = 0.005
+"""Deviation of the centre of mass from its sinusoid that is no finding, root mean square: in cells
+at the axis, and in radii of the object (0.2 % from the bones of a thorax)."""
 AXIAL_ROWS = 0.3
-"""Deviation of the height that is no finding, in rows at the axis, beside what the cone's rays part by."""
+"""Deviation of the height that is no finding, in rows at the axis, beside what the cone's rays
+part by."""
 _SLOW = 8
 """Harmonics of a turn that a motion is looked for in."""
 _SIGMAS = 4.0
 _THIN = 0.5
-"""Of a view's sum, what ends between the rows that are averaged and the next, from which nothing is said of it: of a
-dense disc thinner than a row the readings tell the shadow, not the attenuation."""
+"""Of a view's sum, what ends between the rows that are averaged and the next, from which nothing is
+said of it: of a dense disc thinner than a row the readings tell the shadow, not the attenuation."""
 _LACKING = 0.25
-"""Of what cells lack at the ends of the object at most, how much may change with the direction besides."""
+"""Of what cells lack at the ends of the object at most, how much may change with the direction
+besides."""
 _LARGEST_STEP = 0.2
 """Relative error of the steps beyond which nothing is linear."""
-_DIRECTIONS, _LEAST_ARC = 24, 0.8 * math.pi
+_DIRECTIONS = 24
+_LEAST_ARC = 0.8 * math.pi
 """Fewest directions, and the smallest arc of them, that are tested."""
 
 Floats = NDArray[np.float64]
 
 
 def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
-    """Test the first three moments of a scan whose rows end in air; of a cone beam those of the plane of the source.
+    """Test the first three moments of a scan whose rows end in air; of a cone beam those of the
+    plane of the source.
 
     Args:
         lines: line integrals ``(views, [rows,] columns)`` of any unit, views in any order.
         geometry: parallel, fan or cone beam.
 
     Returns:
-        The test of ``weight`` (relative change of the sum with the direction, root mean square), ``step`` (relative
-        size by which the steps between the views are described too small; of less than a full turn), ``centre`` (mm at
-        the axis by which the centre of mass leaves its sinusoid, root mean square) and, of a cone beam, ``axial`` (mm
-        at the axis by which the object's height changes beyond a wave of one turn).
-        :data:`~torchpcct.checks.scan_test.UNKNOWN` where far less than half a turn of directions was measured.
+        The test of ``weight`` (relative change of the sum with the direction, root mean square),
+        ``step`` (relative size by which the steps between the views are described too small; of
+        less than a full turn), ``centre`` (mm at the axis by which the centre of mass leaves its
+        sinusoid, root mean square) and, of a cone beam, ``axial`` (mm at the axis by which the
+        object's height changes beyond a wave of one turn).
+        :data:`~torchpcct.checks.scan_test.UNKNOWN` where far less than half a turn of directions
+        was measured.
 
     Raises:
         ValueError: a wrong shape, NaN or Inf.
@@ -102,38 +113,56 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     step, step_error = _step(theta, moments[1:])
     cell = float(np.median(np.abs(width)))
     mass = float(moments[0].mean())
-    centre, centre_error = (math.nan, math.inf) if mass <= 0 else _beyond(theta, moments[1] * (scale / mass), 1)
-    axial, axial_error, axial_tolerance = _axial(lines, g) if isinstance(g, ConeBeam) else (math.nan, math.inf, 0.0)
+    centre, centre_error = (
+        (math.nan, math.inf) if mass <= 0 else _beyond(theta, moments[1] * (scale / mass), 1)
+    )
+    axial, axial_error, axial_tolerance = (
+        _axial(lines, g) if isinstance(g, ConeBeam) else (math.nan, math.inf, 0.0)
+    )
     edge = _radius(t, p)
-    if isinstance(g, ConeBeam):  # what ends near the plane is seen by rays on one side of the object alone
+    # what ends near the plane is seen by rays on one side of the object alone
+    if isinstance(g, ConeBeam):
         parted *= min(2.0 * edge / g.sod, 1.0)
     findings = []
     lacks = turned + _edges(theta, p, lack, p.sum(1))
     if _LARGEST_STEP > abs(step) > STEP_TOLERANCE + turned + _SIGMAS * step_error:
         findings.append(
-            "the centre of mass and the width of the views do not turn with them: the steps between the views are "
-            f"described about {100 * abs(step):.2g} ± {100 * step_error:.1g} % too {'small' if step > 0 else 'large'}: "
+            "the centre of mass and the width of the views do not turn with them: the steps "
+            "between the views are "
+            f"described about {100 * abs(step):.2g} ± {100 * step_error:.1g} % too "
+            f"{'small' if step > 0 else 'large'}: "
             "the range of the angles is wrong, or the object moved"
         )
-    # Readings that are no line integrals shift the centre of mass by their share of the radius, motion keeps the sum.
-    elif centre - _SIGMAS * centre_error > max(CENTRE_CELLS * cell, max(CENTRE_RADII + lacks + parted, weight) * edge):
+    # Readings that are no line integrals shift the centre of mass by their share of the radius,
+    # motion keeps the sum.
+    elif centre - _SIGMAS * centre_error > max(
+        CENTRE_CELLS * cell, max(CENTRE_RADII + lacks + parted, weight) * edge
+    ):
         findings.append(
-            f"the centre of mass of the views leaves the sinusoid of an object at rest by {centre:.2g} ± "
-            f"{centre_error:.1g} mm (root mean square): the object moved (breathing, a table), or the angles of the "
+            "the centre of mass of the views leaves the sinusoid of an object at rest by "
+            f"{centre:.2g} ± "
+            f"{centre_error:.1g} mm (root mean square): the object moved (breathing, a table), or "
+            "the angles of the "
             "views are wrong; edges are double or smeared; gate the views, or give the motion"
         )
     elif axial - _SIGMAS * axial_error > axial_tolerance:
         findings.append(
-            f"the object lies about {axial:.2g} mm higher or lower in the course of the turn (root mean square, "
-            f"{axial / axial_error:.0f} standard errors): it moved along the axis, or the table did (a helix told as a "
+            f"the object lies about {axial:.2g} mm higher or lower in the course of the turn "
+            "(root mean square, "
+            f"{axial / axial_error:.0f} standard errors): it moved along the axis, or the table "
+            "did (a helix told as a "
             "circle); give the motion"
         )
     elif weight - _SIGMAS * weight_error > WEIGHT_TOLERANCE + lacks:
         findings.append(
-            f"the sum of a view's line integrals changes with its direction, by {100 * weight:.2g} ± "
-            f"{100 * weight_error:.1g} % (root mean square), that of any object does not: the readings lack most where "
-            "the object is thickest (beam hardening by bone or metal, scatter, a dark signal left in, pile-up, "
-            "saturation, or too few photons for a logarithm), the object moved, or it reaches beyond the rows in some "
+            "the sum of a view's line integrals changes with its direction, by "
+            f"{100 * weight:.2g} ± "
+            f"{100 * weight_error:.1g} % (root mean square), that of any object does not: the "
+            "readings lack most where "
+            "the object is thickest (beam hardening by bone or metal, scatter, a dark signal left "
+            "in, pile-up, "
+            "saturation, or too few photons for a logarithm), the object moved, or it reaches "
+            "beyond the rows in some "
             "views; values are wrong by tens of HU, in long shades"
         )
     found = {
@@ -147,7 +176,8 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
 
 
 def _parallel(angles: Floats, gamma: Floats, p: Floats) -> tuple[Floats, Floats]:
-    """Directions θ = β − γ that all columns measured, and the readings there, ``(directions, columns)``.
+    """Directions θ = β − γ that all columns measured, and the readings there, ``(directions,
+    columns)``.
 
     ``p`` may hold several blocks of columns side by side.
     """
@@ -155,17 +185,23 @@ def _parallel(angles: Floats, gamma: Floats, p: Floats) -> tuple[Floats, Floats]
     if abs(span + usual - 2 * math.pi) < 0.5 * usual:  # a turn that closes
         angles = np.concatenate([angles - 2 * math.pi, angles, angles + 2 * math.pi])
         p = np.tile(p, (3, 1))
-        theta = np.linspace(0.0, 2 * math.pi, round(2 * math.pi / usual), endpoint=False) + angles[len(angles) // 3]
+        theta = (
+            np.linspace(0.0, 2 * math.pi, round(2 * math.pi / usual), endpoint=False)
+            + angles[len(angles) // 3]
+        )
     else:
         first, last = angles[0] - gamma.min(), angles[-1] - gamma.max()
         theta = np.arange(first, last, usual) if usual > 0 else np.zeros(0)
     parts = p.shape[1] // gamma.size
-    sorted_p = np.stack([np.interp(theta + a, angles, p[:, k]) for k, a in enumerate(np.tile(gamma, parts))], 1)
+    sorted_p = np.stack(
+        [np.interp(theta + a, angles, p[:, k]) for k, a in enumerate(np.tile(gamma, parts))], 1
+    )
     return theta, sorted_p
 
 
 def _fit(design: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Least squares, and standard errors from the scatter of neighbours: what interpolation shares is counted once."""
+    """Least squares, and standard errors from the scatter of neighbours: what interpolation
+    shares is counted once."""
     found = np.linalg.lstsq(design, y, rcond=None)[0]
     left = y - design @ found
     free = max(y.size - design.shape[1], 1)
@@ -191,7 +227,9 @@ def _edges(theta: Floats, p: Floats, lacking: Floats, sums: Floats) -> float:
 
 
 def _waves(theta: Floats, orders: tuple[int, ...]) -> Floats:
-    return np.stack([np.ones_like(theta), *(f(k * theta) for k in orders for f in (np.cos, np.sin))], 1)
+    return np.stack(
+        [np.ones_like(theta), *(f(k * theta) for k in orders for f in (np.cos, np.sin))], 1
+    )
 
 
 def _weight(theta: Floats, sums: Floats) -> tuple[float, float]:
@@ -209,7 +247,8 @@ def _radius(t: Floats, p: Floats) -> float:
 
 
 def _beyond(theta: Floats, y: Floats, order: int) -> tuple[float, float]:
-    """Root mean square of the slow changes of ``y`` beyond a constant and waves up to ``order``, and its error."""
+    """Root mean square of the slow changes of ``y`` beyond a constant and waves up to ``order``,
+    and its error."""
     own = _waves(theta, tuple(range(1, order + 1)))
     more: Any
     if theta.size * view_step(theta) > 1.9 * math.pi:
@@ -229,11 +268,11 @@ def _beyond(theta: Floats, y: Floats, order: int) -> tuple[float, float]:
 
 
 def _axial(lines: Tensor, g: ConeBeam) -> tuple[float, float, float]:
-    """Height of the object over the views beyond a wave of one turn, root mean square; its error; what the divergence
-    of the rays may feign. All mm at the axis.
+    """Height of the object over the views beyond a wave of one turn, root mean square; its error;
+    what the divergence of the rays may feign. All mm at the axis.
 
-    The sum of a row over its columns changes with the views by a factor, by its own slope if the object is higher, and
-    by its slope times the row's height if it is nearer to the source.
+    The sum of a row over its columns changes with the views by a factor, by its own slope if the
+    object is higher, and by its slope times the row's height if it is nearer to the source.
     """
     if g.rows < 4:
         return math.nan, math.inf, 0.0
@@ -258,7 +297,8 @@ def _axial(lines: Tensor, g: ConeBeam) -> tuple[float, float, float]:
 
 
 def _step(theta: Floats, moments: list[Floats]) -> tuple[float, float]:
-    """Gauss and Newton's estimate of s in the frequencies 1 + s and 2 (1 + s), of both moments together."""
+    """Gauss and Newton's estimate of s in the frequencies 1 + s and 2 (1 + s), of both moments
+    together."""
     if theta.size * view_step(theta) > 1.9 * math.pi:
         return math.nan, math.inf  # opposite rays tell it better
     parts = []

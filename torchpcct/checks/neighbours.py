@@ -1,27 +1,30 @@
-"""Do neighbouring views fit each other? Views in a wrong order, missing, stuck or displaced, without opposite rays.
+"""Do neighbouring views fit each other? Views in a wrong order, missing, stuck or displaced,
+without opposite rays.
 
-From view to view an object turns by one step. Means of a view under windows that are wide against the way of a point
-in one step are smooth functions of the angle, whatever the object: their change over a pair of views is foretold by
-the changes before and behind it. What is left over,
+From view to view an object turns by one step. Means of a view under windows that are wide against
+the way of a point in one step are smooth functions of the angle, whatever the object: their change
+over a pair of views is foretold by the changes before and behind it. What is left over,
 
     d(v) = x(v + 1) − x(v) − a x′,    x′ from the pairs v ± 1 and v ± 2 alone,
 
-with the described step a, is small and changes slowly in a sound scan; where views are missing, exchanged or of an
-object that has moved, it is as large as so many steps. Over a full turn the last view leads back to the first: a table
-that travels during the turn (a helix), or anything else that does not come back, shows there. Views in random order
-have no smooth functions of the angle at all: the mean squared difference of neighbours is that of any two views (von
-Neumann 1941, Ann. Math. Stat. 12:367). Views that alternate (a focal spot that flies) leave a residual that alternates
-and looks like the slope along the columns or rows. Angles that scatter about the described ones leave one in all views
-that looks like the change itself.
+with the described step a, is small and changes slowly in a sound scan; where views are missing,
+exchanged or of an object that has moved, it is as large as so many steps. Over a full turn the last
+view leads back to the first: a table that travels during the turn (a helix), or anything else that
+does not come back, shows there. Views in random order have no smooth functions of the angle at all:
+the mean squared difference of neighbours is that of any two views (von Neumann 1941, Ann. Math.
+Stat. 12:367). Views that alternate (a focal spot that flies) leave a residual that alternates and
+looks like the slope along the columns or rows. Angles that scatter about the described ones leave
+one in all views that looks like the change itself.
 
-Each mean is taken twice, over columns that share no noise; products of the two are squares without noise, and what the
-two differ by is the noise.
+Each mean is taken twice, over columns that share no noise; products of the two are squares without
+noise, and what the two differ by is the noise.
 
-A reading that two views at different angles share to the last digit is no measurement, if the noise lets few others
-do so: a view, or a module of the detector, that was stuck.
+A reading that two views at different angles share to the last digit is no measurement, if the noise
+lets few others do so: a view, or a module of the detector, that was stuck.
 
-What these tests cannot show: changes that are slow against a step (a slow motion that comes back, a gantry that speeds
-up and slows down; opposite rays and moments see those), and anything about an object that is round about the axis.
+What these tests cannot show: changes that are slow against a step (a slow motion that comes back, a
+gantry that speeds up and slows down; opposite rays and moments see those), and anything about an
+object that is round about the axis.
 """
 
 from __future__ import annotations
@@ -45,24 +48,36 @@ __all__ = ["neighbour_test", "stuck_views"]
 
 Floats = NDArray[np.float64]
 
-JUMP_STEPS, OTHER_STEPS, JUMP_CELLS = 0.9, 10.0, 0.5
-"""Steps by which two views may lie farther apart than described, by which they may differ otherwise (plane faces that
-the rays pass along do), and cells at the border of the object that are no finding."""
+JUMP_STEPS = 0.9
+OTHER_STEPS = 10.0
+JUMP_CELLS = 0.5
+"""Steps by which two views may lie farther apart than described, by which they may differ otherwise
+(plane faces that the rays pass along do), and cells at the border of the object that are no
+finding."""
 ALTERNATION = 0.25
 """Shift between views (or columns) that alternate, in cells at the axis, that is no finding."""
-_SIGMAS, _JUMP_SIGMAS = 8.0, 10.0
+_SIGMAS = 8.0
+_JUMP_SIGMAS = 10.0
 _GOES_ON = 0.25
 """Part of a step back that one of the next pairs makes up for at least."""
-_BURST, _BURST_AT_THE_END = 25.0, 9.0
-"""How many times larger than beside it a squared residual must be; where a turn closes, the one pair of its kind."""
-_SHARE, _SHARE_AT_THE_END, _SHARE_OF_MANY, _FEW_WINDOWS = 0.4, 0.25, 0.15, 5
-"""Share of the windows on the object that a view at a wrong place changes, that a travel changes which only shows where
-the object has an upper or lower end, that many steps forward change beyond the noise; and windows below which nearly
-all must."""
-_SCATTER, _SCATTER_SIGMAS, _LIKE_THE_CHANGE, _CLEAR = (0.3, 0.8), 5.0, (0.6, 1.6), 0.5
-"""Median residual in steps of angles that scatter (more: the views are in no order), and the standard errors by which
-it is none of noise; share of it that must look like the change; and squared change over its noise below which nothing
-is said. Edges leave up to 0.23 in sound scans."""
+_BURST = 25.0
+_BURST_AT_THE_END = 9.0
+"""How many times larger than beside it a squared residual must be; where a turn closes, the one
+pair of its kind."""
+_SHARE = 0.4
+_SHARE_AT_THE_END = 0.25
+_SHARE_OF_MANY = 0.15
+_FEW_WINDOWS = 5
+"""Share of the windows on the object that a view at a wrong place changes, that a travel changes
+which only shows where the object has an upper or lower end, that many steps forward change beyond
+the noise; and windows below which nearly all must."""
+_SCATTER = (0.3, 0.8)
+_SCATTER_SIGMAS = 5.0
+_LIKE_THE_CHANGE = (0.6, 1.6)
+_CLEAR = 0.5
+"""Median residual in steps of angles that scatter (more: the views are in no order), and the
+standard errors by which it is none of noise; share of it that must look like the change; and
+squared change over its noise below which nothing is said. Edges leave up to 0.23 in sound scans."""
 _STEPS_A_RESIDUAL = 0.6745 * math.sqrt(7.0)
 """Median size of the residual of angles that scatter independently by one step (normal, rms)."""
 _REACH = 4
@@ -70,8 +85,11 @@ _REACH = 4
 _STEADY = 1.5
 """Steps of this size, in usual ones, and larger are gaps."""
 _ROWS = 6
-_WINDOW_STEPS, _LEAST_WINDOW, _LEAST_STEPS = 16.0, 12, 5.0
-"""Width of a window in ways of a border point in one step, the smallest in columns, and the fewest such ways."""
+_WINDOW_STEPS = 16.0
+_LEAST_WINDOW = 12
+_LEAST_STEPS = 5.0
+"""Width of a window in ways of a border point in one step, the smallest in columns, and the
+fewest such ways."""
 _FEWEST_VIEWS = 24
 _SLOW_HARMONICS = 4.0
 """Harmonics of a turn up to which the widest windows change; moments of order k have k."""
@@ -80,10 +98,13 @@ _STUCK_SHARE = 0.98
 _STUCK_COLUMNS = 16
 """Columns that are looked at together for readings that repeat."""
 _POPULAR = 0.02
-"""Share of all readings from which a value is a limit of the detector or one of few, and its repetition no surprise."""
+"""Share of all readings from which a value is a limit of the detector or one of few, and its
+repetition no surprise."""
 _CHANCE = 1e-9
-_DARK_VIEWS, _DARK_WIDTH = 8, 3
-"""Views for which, and columns side by side that, a module of the detector is off; narrower ones are bridged."""
+_DARK_VIEWS = 8
+_DARK_WIDTH = 3
+"""Views for which, and columns side by side that, a module of the detector is off; narrower ones
+are bridged."""
 _MOST = 4_000_000
 """Readings that are looked at; more only cost time."""
 
@@ -97,9 +118,10 @@ def neighbour_test(lines: Tensor, geometry: Geometry) -> ScanTest:
         geometry: parallel, fan or cone beam.
 
     Returns:
-        The test of ``order`` (mean squared difference of neighbours over that of any two views: 1 in random order),
-        ``jump`` (largest distance of two neighbours beyond the described one, in steps), ``alternation`` (shift of
-        views that alternate, in cells at the axis) and ``scatter`` (of the angles about the described ones, in steps).
+        The test of ``order`` (mean squared difference of neighbours over that of any two views: 1
+        in random order), ``jump`` (largest distance of two neighbours beyond the described one, in
+        steps), ``alternation`` (shift of views that alternate, in cells at the axis) and
+        ``scatter`` (of the angles about the described ones, in steps).
         :data:`~torchpcct.checks.scan_test.UNKNOWN` of fewer than 24 views or 24 columns.
 
     Raises:
@@ -118,9 +140,12 @@ def neighbour_test(lines: Tensor, geometry: Geometry) -> ScanTest:
         sizes["order"] = order
         if order > limit:
             findings.append(
-                f"neighbouring views differ as much as {100 * min(order, 1.0):.0f} % of what any two views do, of an "
-                f"object that turns by {math.degrees(views.step):.2g}° at most {100 * limit:.0f} %: the views are not "
-                "in the order of their angles (files sorted by the text of their names: 1, 10, 100, 2?), or the angles "
+                f"neighbouring views differ as much as {100 * min(order, 1.0):.0f} % of what any "
+                "two views do, of an "
+                f"object that turns by {math.degrees(views.step):.2g}° at most {100 * limit:.0f} "
+                "%: the views are not "
+                "in the order of their angles (files sorted by the text of their names: 1, 10, "
+                "100, 2?), or the angles "
                 "are wrong; everything in the volume is"
             )
             return ScanTest(sizes, errors, tuple(findings))
@@ -135,7 +160,8 @@ def neighbour_test(lines: Tensor, geometry: Geometry) -> ScanTest:
             findings.append(alternating[2])
     if scatter is not None:
         sizes["scatter"], errors["scatter"] = scatter[0], scatter[1]
-        if scatter[2] and not (alternating and alternating[2]):  # the largest of many jumps is none by itself
+        # the largest of many jumps is none by itself
+        if scatter[2] and not (alternating and alternating[2]):
             findings = [scatter[2]]
     return ScanTest(sizes, errors, tuple(findings))
 
@@ -188,8 +214,8 @@ class _Views:
         return views if views.radius > 0.0 and views.step > 0.0 else None
 
     def means(self, width: int, slope: bool = False) -> tuple[Floats, Floats]:
-        """Means under Hann windows of so many columns, of two sets of columns that do not touch, ``(views, rows,
-        windows)``; ``slope``: of the slopes along the columns, per column."""
+        """Means under Hann windows of so many columns, of two sets of columns that do not touch,
+        ``(views, rows, windows)``; ``slope``: of the slopes along the columns, per column."""
         columns = self.p.shape[-1]
         number = max(2, round(2.0 * (columns - width) / width) + 1)
         starts = np.linspace(0.0, columns - width, number)
@@ -228,7 +254,10 @@ class _Views:
         steps = (np.diff(a, axis=0) * np.diff(b, axis=0)).sum(1)
         n = len(whole)
         # A round object shows noise only: its products scatter about 0.
-        if whole.mean() < _SIGMAS * float(noise.sum(1).mean()) / math.sqrt(n) or whole.mean() <= 0.0:
+        if (
+            whole.mean() < _SIGMAS * float(noise.sum(1).mean()) / math.sqrt(n)
+            or whole.mean() <= 0.0
+        ):
             return math.nan, limit, False
         ratio = float(steps.mean() / (2.0 * whole.mean()))
         error = float(steps.std()) / math.sqrt(n) / (2.0 * float(whole.mean()))
@@ -262,15 +291,20 @@ class _Views:
         scatter = scatter + 0.1 * scatter.mean() + 1e-9 * np.square(change[0]).mean()
         change = [c / np.sqrt(scatter) for c in change]
         rate = [c / a[:, None] for c in change]
-        # The rate at the pair from two pairs before and two behind it: exact for a cubic function of the angle.
-        foretold = [((r[1:-3] + r[3:-1]) * (4.0 / 6.0) - (r[:-4] + r[4:]) / 6.0) * a[2:-2, None] for r in rate]
+        # The rate at the pair from two pairs before and two behind it: exact for a cubic function
+        # of the angle.
+        foretold = [
+            ((r[1:-3] + r[3:-1]) * (4.0 / 6.0) - (r[:-4] + r[4:]) / 6.0) * a[2:-2, None]
+            for r in rate
+        ]
         left = [c[2:-2] - f for c, f in zip(change, foretold, strict=True)]
         turning = [(r[3:-1] - r[1:-3]) * a[2:-2, None] for r in rate]
         kink = (turning[0] * turning[1]).sum(1)
         steady = np.all([a[k : k + pairs] < _STEADY * self.step for k in range(5)], axis=0)
         square, usual = ((x[0] * x[1]).sum(1) for x in (left, foretold))
         near = np.maximum(_beside(square, self.closes), 0.0)
-        # The noise of these sums, from what the sets differ by there and beside it; windows overlap by half.
+        # The noise of these sums, from what the sets differ by there and beside it; windows overlap
+        # by half.
         apart = 0.5 * np.square(left[0] - left[1]).sum(1)
         single = 0.5 * np.square(change[0] - change[1]).sum(1)
         there = np.median([single[k : k + pairs] for k in (0, 1, 3, 4)], axis=0)
@@ -286,24 +320,32 @@ class _Views:
         shift = np.where(seen, along / np.where(seen, usual, 1.0), 0.0)
         # No step forward, or many: a step back is none of a gantry.
         along_it = seen & (shift**2 * usual > 0.6 * square) & (shift > -1.5)
-        # Views that are stuck or exchanged go back and on again; an opaque face that the rays pass along need not.
+        # Views that are stuck or exchanged go back and on again; an opaque face that the rays pass
+        # along need not.
         padded = np.pad(shift, 2)
         onward = np.max([padded[k : k + pairs] for k in (0, 1, 3, 4)], axis=0)
         along_it &= (shift > 0.0) | (onward > _GOES_ON * np.abs(shift))
         # Pair k is of the views k + 2 and k + 3 of the longer sequence.
         first = (np.arange(pairs) + 2 - (_REACH if self.closes else 0)) % n
         burst = np.where(self.closes & (first == n - 1), _BURST_AT_THE_END, _BURST)
-        share = np.where(burst < _BURST, _SHARE_AT_THE_END, np.where(along_it & (steps > 3.0), _SHARE_OF_MANY, _SHARE))
+        share = np.where(
+            burst < _BURST,
+            _SHARE_AT_THE_END,
+            np.where(along_it & (steps > 3.0), _SHARE_OF_MANY, _SHARE),
+        )
         found = (
             steady
             & (self._share(left, change, columns, first) > share)
             & (steps > np.where(along_it | (burst < _BURST), JUMP_STEPS, OTHER_STEPS))
             & (steps > JUMP_CELLS / self.way)
             & (square > burst * near)
-            & (square > 2.0 * kink)  # an edge that the rays pass along turns the rate about, and makes no step
+            # an edge that the rays pass along turns the rate about, and makes no step
+            & (square > 2.0 * kink)
             & (square > _JUMP_SIGMAS * noisy)
         )
-        most = int(np.argmax(np.where(found, square, -1.0))) if found.any() else int(np.argmax(steps))
+        most = (
+            int(np.argmax(np.where(found, square, -1.0))) if found.any() else int(np.argmax(steps))
+        )
         # Of the square root of a sum whose noise is that of products with the signal.
         error = math.sqrt(float(noisy[most]) / scale / max(left[0].shape[1] / 2.0, 1.0) ** 0.5)
         if not found.any():
@@ -316,7 +358,8 @@ class _Views:
         return _Jumps(float(steps[most]), error, (text,), scatter)
 
     def _scatter(self, left: list[Floats], foretold: list[Floats]) -> tuple[float, float, str]:
-        """Of the angles about the described ones in steps, rms: what the residuals of all pairs have of the change.
+        """Of the angles about the described ones in steps, rms: what the residuals of all pairs
+        have of the change.
 
         Products of the two sets are squares without noise; the median passes over edges.
         """
@@ -325,7 +368,11 @@ class _Views:
         one, other = ((left[k] * foretold[1 - k]).sum(1)[clear] / usual[clear] for k in range(2))
         products = one * other
         n, median = products.size, float(np.median(products))
-        error = math.sqrt(math.pi / 2.0 / n) * MEDIAN_TO_SD * float(np.median(np.abs(products - median)))
+        error = (
+            math.sqrt(math.pi / 2.0 / n)
+            * MEDIAN_TO_SD
+            * float(np.median(np.abs(products - median)))
+        )
         size = math.sqrt(max(median, 0.0))
         steps = size / _STEPS_A_RESIDUAL
         spread = error / (2.0 * max(size, math.sqrt(error), 1e-300)) / _STEPS_A_RESIDUAL
@@ -333,23 +380,34 @@ class _Views:
         # Noise of the two sets has the same sign by chance.
         sigmas = (2.0 * float((products > 0.0).mean()) - 1.0) * math.sqrt(n)
         low, high = _LIKE_THE_CHANGE
-        if not (_SCATTER[0] < size < _SCATTER[1] and sigmas > _SCATTER_SIGMAS and low * whole < alike < high * whole):
+        if not (
+            _SCATTER[0] < size < _SCATTER[1]
+            and sigmas > _SCATTER_SIGMAS
+            and low * whole < alike < high * whole
+        ):
             return steps, spread, ""
         return (
             steps,
             spread,
-            f"the views scatter by about {steps:.1g} of a step about the described angles ({sigmas:.0f} standard "
-            "errors): the gantry does not turn evenly, or the object trembles; give the measured angle of each view",
+            f"the views scatter by about {steps:.1g} of a step about the described angles "
+            f"({sigmas:.0f} standard "
+            "errors): the gantry does not turn evenly, or the object trembles; give the measured "
+            "angle of each view",
         )
 
-    def _share(self, left: list[Floats], change: list[Floats], columns: int, first: NDArray[np.int64]) -> Floats:
-        """Share of the windows along the columns in which a pair of views is off by half a step or more.
+    def _share(
+        self, left: list[Floats], change: list[Floats], columns: int, first: NDArray[np.int64]
+    ) -> Floats:
+        """Share of the windows along the columns in which a pair of views is off by half a step or
+        more.
 
-        A plane face that the rays pass along changes a few windows at once, a view at a wrong place all of them.
+        A plane face that the rays pass along changes a few windows at once, a view at a wrong place
+        all of them.
         """
         pairs = len(left[0])
         square, usual = (
-            (x[0] * x[1]).reshape(len(x[0]), -1, columns).sum(1) for x in (left, [c[2:-2] for c in change])
+            (x[0] * x[1]).reshape(len(x[0]), -1, columns).sum(1)
+            for x in (left, [c[2:-2] for c in change])
         )
         noise = 0.5 * np.square(left[0] - left[1]).reshape(pairs, -1, columns).sum(1)
         noise = np.stack([_beside(noise[:, k], self.closes) for k in range(columns)], 1)
@@ -361,33 +419,46 @@ class _Views:
         ends = self.closes & (first == len(self.angles) - 1)
         return np.where(ends | (share > 0.75), share, 0.0)
 
-    def _jump_text(self, at: list[int], most: int, size: float, sigmas: float, explained: bool) -> str:
+    def _jump_text(
+        self, at: list[int], most: int, size: float, sigmas: float, explained: bool
+    ) -> str:
         n = len(self.angles)
         sure = f"({min(sigmas, 999.0):.0f} standard errors)"
         if self.closes and most == n - 1:
             return (
-                f"the last view (number {self.number[-1]}) does not lead back to the first ({self.number[0]}): they "
-                f"differ by {abs(size):.2g} times what neighbouring views do {sure}: something moved on during "
-                "the turn (a table that travels, a helix told as a circle, an object that sinks or breathes), or the "
+                f"the last view (number {self.number[-1]}) does not lead back to the first "
+                f"({self.number[0]}): they "
+                f"differ by {abs(size):.2g} times what neighbouring views do {sure}: something "
+                "moved on during "
+                "the turn (a table that travels, a helix told as a circle, an object that sinks "
+                "or breathes), or the "
                 "range of the angles is wrong; give the motion or the true angles"
             )
         pair = f"the views {self.number[most]} and {self.number[(most + 1) % n]}"
         more = f" (and {len(at) - 1} more pairs)" if len(at) > 1 else ""
         if explained and size > 0.0:
             return (
-                f"{pair}{more} lie about {1.0 + size:.2g} steps apart, not one {sure}: views are missing there, stuck "
-                "or out of order (files sorted by the text of their names: 1, 10, 100, 2?), or the angles are wrong; "
+                f"{pair}{more} lie about {1.0 + size:.2g} steps apart, not one {sure}: views are "
+                "missing there, stuck "
+                "or out of order (files sorted by the text of their names: 1, 10, 100, 2?), or "
+                "the angles are wrong; "
                 "give the angle of each view, in the order of the views"
             )
         return (
-            f"{pair}{more} differ by {abs(size):.2g} times what neighbouring views do {sure}: views are exchanged, "
+            f"{pair}{more} differ by {abs(size):.2g} times what neighbouring views do {sure}: "
+            "views are exchanged, "
             "missing, stuck or out of order, or the object moved; sort the views by their angles"
         )
 
     def alternation(self) -> tuple[float, float, str] | None:
         """Shift along the columns, or the rows, of views that alternate; its error; what to say."""
-        width = max(self.width, 2 * _LEAST_WINDOW) if self.g.columns >= 4 * _LEAST_WINDOW else _LEAST_WINDOW
-        turns = np.sign(np.diff(self.number))  # the order of the angles must be that of the views, or the other way
+        width = (
+            max(self.width, 2 * _LEAST_WINDOW)
+            if self.g.columns >= 4 * _LEAST_WINDOW
+            else _LEAST_WINDOW
+        )
+        # the order of the angles must be that of the views, or the other way
+        turns = np.sign(np.diff(self.number))
         if self.way * _LEAST_STEPS > width or np.any(turns != turns[0]):
             return None
         values, slopes = self.means(width), self.means(width, slope=True)
@@ -404,21 +475,31 @@ class _Views:
                 size, error = found
                 if best is None:
                     best = (size, error, "")
-                limit = ALTERNATION if along == "columns" else ALTERNATION * _ROWS / max(self.g.rows, _ROWS)
+                limit = (
+                    ALTERNATION
+                    if along == "columns"
+                    else ALTERNATION * _ROWS / max(self.g.rows, _ROWS)
+                )
                 if size - _SIGMAS * error > limit and not (best[2] and best[0] > size):
                     scale = 1.0 if along == "columns" else max(self.g.rows / _ROWS, 1.0)
                     best = (
                         scale * size,
                         scale * error,
-                        f"views that follow each other lie about {scale * size:.2g} {along} apart by turns, with a "
-                        f"period of {period} views ({size / error:.0f} standard errors): a focal spot that flies, "
-                        "which the geometry does not describe; give its positions (VectorGeometry), or reconstruct "
+                        f"views that follow each other lie about {scale * size:.2g} {along} apart "
+                        "by turns, with a "
+                        f"period of {period} views ({size / error:.0f} standard errors): a focal "
+                        "spot that flies, "
+                        "which the geometry does not describe; give its positions "
+                        "(VectorGeometry), or reconstruct "
                         "the views of one position",
                     )
         return best
 
-    def _alternates(self, bends: list[Floats], slope: Any, period: int) -> tuple[float, float] | None:
-        """Peak-to-peak shift of views with this period, and its error from the scatter of blocks of views."""
+    def _alternates(
+        self, bends: list[Floats], slope: Any, period: int
+    ) -> tuple[float, float] | None:
+        """Peak-to-peak shift of views with this period, and its error from the scatter of blocks
+        of views."""
         n = len(bends[0])
         index = np.arange(1, n + 1)
         blocks = np.array_split(np.arange(n), 16)
@@ -431,7 +512,9 @@ class _Views:
             return None
         for wave in waves:
             w = wave(2.0 * math.pi * index / period)[:, None, None]
-            score = ((w * (bends[0] * slope[1][1:-1] + bends[1] * slope[0][1:-1])).sum((1, 2))) / 2.0
+            score = (
+                (w * (bends[0] * slope[1][1:-1] + bends[1] * slope[0][1:-1])).sum((1, 2))
+            ) / 2.0
             parts = np.array([score[b].sum() for b in blocks])
             norm = total * keeps * (1.0 if period == 2 else 0.5)
             found.append(float(parts.sum()) / norm)
@@ -459,11 +542,13 @@ def stuck_views(readings: Tensor, geometry: Geometry) -> list[str]:
     """Name views at different angles that hold the same readings, to the last digit.
 
     Args:
-        readings: as they were stored, ``(views, [rows,] columns)`` with noise; NaN where they are not to be looked at.
+        readings: as they were stored, ``(views, [rows,] columns)`` with noise; NaN where they are
+            not to be looked at.
         geometry: parallel, fan or cone beam.
 
     Returns:
-        One sentence; empty if no views repeat, or repetition is no surprise (values of few digits, no noise).
+        One sentence; empty if no views repeat, or repetition is no surprise (values of few digits,
+        no noise).
     """
     g: Any = geometry
     if readings.ndim != len(g.shape) or g.views < _FEWEST_VIEWS or g.columns < _STUCK_COLUMNS:
@@ -481,7 +566,8 @@ def stuck_views(readings: Tensor, geometry: Geometry) -> list[str]:
     edges = np.arange(0, g.columns - _STUCK_COLUMNS + 1, _STUCK_COLUMNS)
     same, of = (np.add.reduceat(v.sum(1), edges, axis=1).astype(np.float64) for v in (equal, both))
     enough = (of >= _STUCK_COLUMNS // 2) & apart[:, None]
-    # How often neighbouring views of these columns share a reading by chance, or because nothing changes.
+    # How often neighbouring views of these columns share a reading by chance, or because nothing
+    # changes.
     chance = np.ones(len(edges))
     for k in np.flatnonzero(enough.sum(0) >= 8):
         chance[k] = np.median(same[enough[:, k], k] / of[enough[:, k], k])
@@ -489,7 +575,8 @@ def stuck_views(readings: Tensor, geometry: Geometry) -> list[str]:
     unlikely = of * np.log(np.maximum(chance, 0.05)) < math.log(_CHANCE / max(int(enough.sum()), 1))
     stuck = enough & few & (same >= _STUCK_SHARE * of) & (of > 0) & unlikely
     later = _copies(n, told, angles)
-    # Readings without noise repeat where nothing moves: noise of neighbouring columns has nothing in common.
+    # Readings without noise repeat where nothing moves: noise of neighbouring columns has nothing
+    # in common.
     if not (stuck.any() or later) or not _noisy(n, edges, stuck):
         return dark
     pairs = np.flatnonzero(stuck.any(1))
@@ -499,13 +586,16 @@ def stuck_views(readings: Tensor, geometry: Geometry) -> list[str]:
     which = ", ".join(map(str, views)) if len(views) <= 4 else f"{views[0]} … {views[-1]}"
     return [
         *dark,
-        f"{len(views)} views{where} hold the same readings as views at other angles, noise and all (views {which}): "
-        "the detector was stuck, or files were copied; leave them out (Scan.select), or mask them (dead=)",
+        f"{len(views)} views{where} hold the same readings as views at other angles, noise and "
+        f"all (views {which}): "
+        "the detector was stuck, or files were copied; leave them out (Scan.select), or mask them "
+        "(dead=)",
     ]
 
 
 def _dark_columns(n: NDArray[Any], order: NDArray[np.int64]) -> list[str]:
-    """Columns side by side that go dark at once, stay so, and are bright again at once: no shadow does that.
+    """Columns side by side that go dark at once, stay so, and are bright again at once: no shadow
+    does that.
 
     Args:
         n: ``(views, rows, columns)``.
@@ -519,7 +609,14 @@ def _dark_columns(n: NDArray[Any], order: NDArray[np.int64]) -> list[str]:
         change = np.diff(np.pad(dark[:, row].astype(np.int8), ((1, 1), (0, 0))), axis=0)
         begins, ends = change.T == 1, change.T == -1  # (columns, views + 1)
         columns = np.nonzero(begins)[0]
-        spans = list(zip(columns.tolist(), np.nonzero(begins)[1].tolist(), np.nonzero(ends)[1].tolist(), strict=True))
+        spans = list(
+            zip(
+                columns.tolist(),
+                np.nonzero(begins)[1].tolist(),
+                np.nonzero(ends)[1].tolist(),
+                strict=True,
+            )
+        )
         known = set(spans)
         for column, first, end in spans:
             long = end - first >= _DARK_VIEWS and (first > 0 or end < len(n))
@@ -535,14 +632,17 @@ def _dark_columns(n: NDArray[Any], order: NDArray[np.int64]) -> list[str]:
         return []
     (column, width, first), views = max(found.items(), key=lambda item: item[0][1] * item[1])
     return [
-        f"the columns {column} … {column + width - 1} read nothing in {views} views from number {order[first]} on, and "
-        "go dark and bright again all at once, which no shadow does: a module of the detector was off; mask it "
+        f"the columns {column} … {column + width - 1} read nothing in {views} views from number "
+        f"{order[first]} on, and "
+        "go dark and bright again all at once, which no shadow does: a module of the detector was "
+        "off; mask it "
         "(dead=), or leave the views out (Scan.select)"
     ]
 
 
 def _copies(n: NDArray[Any], told: NDArray[np.bool_], angles: Floats) -> list[int]:
-    """Whole views that repeat another one at a different angle, most of whose readings say something."""
+    """Whole views that repeat another one at a different angle, most of whose readings say
+    something."""
     first: dict[bytes, int] = {}
     found = []
     for k in np.flatnonzero(told.mean((1, 2)) > 0.5).tolist():
@@ -558,7 +658,8 @@ def _columns_text(edges: NDArray[np.int64], stuck: NDArray[np.bool_]) -> str:
 
 
 def _noisy(n: NDArray[Any], edges: NDArray[np.int64], stuck: NDArray[np.bool_]) -> bool:
-    """Whether what changes from view to view in the columns that were stuck differs from column to column."""
+    """Whether what changes from view to view in the columns that were stuck differs from column
+    to column."""
     products, squares = 0.0, 0.0
     for k in np.flatnonzero(stuck.any(0)) if stuck.any() else range(len(edges)):
         part = n[:, :, edges[k] : edges[k] + _STUCK_COLUMNS].astype(np.float64)

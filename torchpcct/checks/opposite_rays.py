@@ -1,32 +1,39 @@
-"""Does a full turn agree with itself? Opposite rays see one line, so a wrong description shows without an image.
+"""Does a full turn agree with itself? Opposite rays see one line, so a wrong description shows
+without an image.
 
-The ray of source angle β and fan angle γ is met again by that of β + π − 2γ and −γ (the consistency condition behind
-the moments of Helgason and Ludwig). Read there D(β + a, γ + e) instead of D(β, γ), the difference is, to first order,
+The ray of source angle β and fan angle γ is met again by that of β + π − 2γ and −γ (the consistency
+condition behind the moments of Helgason and Ludwig). Read there D(β + a, γ + e) instead of D(β, γ),
+the difference is, to first order,
 
     r = −a ∂D/∂β − e ∂D/∂γ + noise,
 
 and each error of the description has its own a and e:
 
-* columns described ε above where they are: e = −2ε (of a detector rolled by θ ε = θ v changes with the row's height v);
-* fan angles (pitch over sdd) too small by the factor 1 + κ: a = 2κγ, nothing in the middle, most at the edges;
-* steps between the views too small by the factor 1 + s: a = s (β' − β), β' the described angle at which the scanner was
-  when it read the opposite ray: half a turn later, or earlier.
+* columns described ε above where they are: e = −2ε (of a detector rolled by θ ε = θ v changes with
+  the row's height v);
+* fan angles (pitch over sdd) too small by the factor 1 + κ: a = 2κγ, nothing in the middle, most at
+  the edges;
+* steps between the views too small by the factor 1 + s: a = s (β' − β), β' the described angle at
+  which the scanner was when it read the opposite ray: half a turn later, or earlier.
 
-r is regressed on each pattern. The slopes of the two rays have independent noise, so the product of one's, smoothed,
-and the other's, raw, neither shrinks nor stretches the estimate (instrumental variables, Durbin 1954, Rev. Int. Stat.
-Inst. 22:23). Its error is that of the sums over blocks of views, which knows nothing of how noisy a reading is: the
-test statistic is Student's. The cause that explains most of r is named. Where none does, the share of r in what changes
-from view to view says whether the rays have anything in common; products of neighbouring columns are free of noise.
+r is regressed on each pattern. The slopes of the two rays have independent noise, so the product of
+one's, smoothed, and the other's, raw, neither shrinks nor stretches the estimate (instrumental
+variables, Durbin 1954, Rev. Int. Stat. Inst. 22:23). Its error is that of the sums over blocks of
+views, which knows nothing of how noisy a reading is: the test statistic is Student's. The cause
+that explains most of r is named. Where none does, the share of r in what changes from view to view
+says whether the rays have anything in common; products of neighbouring columns are free of noise.
 
-An object that moves during the turn stands elsewhere when the opposite ray comes: ε then changes with β. Of a movement
-c(β) along the columns, opposite rays show c(β) + c(β + π), so once in a turn looks like an object that stands elsewhere
-and is none of our business; twice in a turn is what is tested, a wave cos 2β, sin 2β of ε.
+An object that moves during the turn stands elsewhere when the opposite ray comes: ε then changes
+with β. Of a movement c(β) along the columns, opposite rays show c(β) + c(β + π), so once in a turn
+looks like an object that stands elsewhere and is none of our business; twice in a turn is what is
+tested, a wave cos 2β, sin 2β of ε.
 
-What no opposite rays can show, since the described scan is that of another object, a right one: the angle of the first
-view (the object turned), sod (the object scaled, its attenuation the other way; so are parallel rays' pitch), both the
-direction of rotation and that of the columns (the object mirrored; of parallel rays each alone), a displacement of the
-object, and all that happens to both rays alike: water's attenuation, gain and bowtie if air was measured with them,
-spectrum and pile-up (:mod:`torchpcct.checks.moments` sees those in bodies that are not round).
+What no opposite rays can show, since the described scan is that of another object, a right one: the
+angle of the first view (the object turned), sod (the object scaled, its attenuation the other way;
+so are parallel rays' pitch), both the direction of rotation and that of the columns (the object
+mirrored; of parallel rays each alone), a displacement of the object, and all that happens to both
+rays alike: water's attenuation, gain and bowtie if air was measured with them, spectrum and pile-up
+(:mod:`torchpcct.checks.moments` sees those in bodies that are not round).
 """
 
 from __future__ import annotations
@@ -47,24 +54,38 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry, view_step
 from torchpcct.validate import checked
 
-__all__ = ["CENTRE_TOLERANCE", "FALSE_ALARMS", "SCALE_TOLERANCE", "STEP_TOLERANCE", "centre_test", "geometry_test"]
+__all__ = [
+    "CENTRE_TOLERANCE",
+    "FALSE_ALARMS",
+    "SCALE_TOLERANCE",
+    "STEP_TOLERANCE",
+    "centre_test",
+    "geometry_test",
+]
 
 CENTRE_TOLERANCE = 0.1
-"""Error of the centre in columns that is no finding: alignment, and what interpolation between the views leaves."""
-SCALE_TOLERANCE, STEP_TOLERANCE = 0.003, 0.001
-"""Relative errors of the fan angles and of the steps between views that are none: what mechanics leave."""
+"""Error of the centre in columns that is no finding: alignment, and what interpolation between
+the views leaves."""
+SCALE_TOLERANCE = 0.003
+STEP_TOLERANCE = 0.001
+"""Relative errors of the fan angles and of the steps between views that are none: what mechanics
+leave."""
 FALSE_ALARMS = 0.0005
-"""Share of scans with an error of :data:`CENTRE_TOLERANCE` that are taken for wrong; of faultless ones it is less.
-None of 500 sound scans should be told anything."""
+"""Share of scans with an error of :data:`CENTRE_TOLERANCE` that are taken for wrong; of faultless
+ones it is less. None of 500 sound scans should be told anything."""
 _COLUMNS = (5, 25)
-"""Columns over which the slope is smoothed: a few for small errors, many for those of several columns."""
-_DIFFER, _STRANGERS = 0.03, 0.3
-"""Mean square of the difference over that of what changes from view to view: from the first one opposite rays differ,
-from the second one they have nothing to do with each other."""
+"""Columns over which the slope is smoothed: a few for small errors, many for those of several
+columns."""
+_DIFFER = 0.03
+_STRANGERS = 0.3
+"""Mean square of the difference over that of what changes from view to view: from the first one
+opposite rays differ, from the second one they have nothing to do with each other."""
 _EXPLAINED = 0.1
-"""Share of the difference that a cause must explain to be named where opposite rays have little in common."""
+"""Share of the difference that a cause must explain to be named where opposite rays have little
+in common."""
 _LARGEST = 0.3
-"""Relative errors and angles in rad beyond which nothing is linear: no cause is named for what is larger."""
+"""Relative errors and angles in rad beyond which nothing is linear: no cause is named for what
+is larger."""
 _KNOWN = 0.1
 """Part of its tolerance to which a size is known at best."""
 _FINE_STEP_RAD = math.radians(2.5)
@@ -79,19 +100,21 @@ def centre_test(
     window: DetectorWindow | None = None,
     about: tuple[float, float] = (0.0, 0.0),
 ) -> ScanTest:
-    """Measure the rotation centre by the opposite rays of a scan, of a cone beam by those near the plane of the source.
+    """Measure the rotation centre by the opposite rays of a scan, of a cone beam by those near the
+    plane of the source.
 
     Args:
-        lines: line integrals ``(views, [rows,] columns)`` of any unit, on ``window``, what all views share taken off.
-            Views in any order.
+        lines: line integrals ``(views, [rows,] columns)`` of any unit, on ``window``, what all
+            views share taken off. Views in any order.
         geometry: parallel, fan or cone beam.
         window: of the readings; None: the whole detector.
         about: (y, x) in mm of what the readings show: views are interpolated along its path.
 
     Returns:
-        The test of ``centre``: how many columns too high the described positions of the columns are; and of ``swing``,
-        the amplitude in columns by which it changes twice in a turn. :data:`UNKNOWN` where no opposite rays were
-        measured or nothing is to be seen.
+        The test of ``centre``: how many columns too high the described positions of the columns
+            are; and of ``swing``,
+        the amplitude in columns by which it changes twice in a turn. :data:`UNKNOWN` where no
+        opposite rays were measured or nothing is to be seen.
 
     Raises:
         ValueError: a wrong shape, NaN or Inf.
@@ -107,18 +130,20 @@ def geometry_test(
     window: DetectorWindow | None = None,
     about: tuple[float, float] = (0.0, 0.0),
 ) -> ScanTest:
-    """Test the description of a scan by its opposite rays: centre, fan angles, steps between views, roll.
+    """Test the description of a scan by its opposite rays: centre, fan angles, steps between views,
+    roll.
 
     Args:
         lines, geometry, window, about: see :func:`centre_test`.
 
     Returns:
-        The test of ``centre`` (see :func:`centre_test`), ``scale`` (fan angles described too small, relative), ``step``
-        (steps between views described too small, relative), ``roll`` in rad, and ``mismatch``: the mean square of the
-        difference over that of what changes from view to view, noise taken off, 0 of a sound scan, 1 of rays that have
-        nothing to do with each other. Of several causes the one that explains most is named, and its size measured
-        again where nothing is left of it; the others' are of first order. What is said after ± is twice the standard
-        error: 95 % of such errors lie within.
+        The test of ``centre`` (see :func:`centre_test`), ``scale`` (fan angles described too small,
+        relative), ``step`` (steps between views described too small, relative), ``roll`` in rad,
+        and ``mismatch``: the mean square of the difference over that of what changes from view to
+        view, noise taken off, 0 of a sound scan, 1 of rays that have nothing to do with each other.
+        Of several causes the one that explains most is named, and its size measured again where
+        nothing is left of it; the others' are of first order. What is said after ± is twice the
+        standard error: 95 % of such errors lie within.
 
     Raises:
         ValueError: a wrong shape, NaN or Inf.
@@ -127,8 +152,12 @@ def geometry_test(
     if pairs is None:
         return UNKNOWN
     centre, explained = _centre(pairs, FALSE_ALARMS / 3.0)
-    sizes, errors = ({k: v for k, v in values.items() if k == "centre"} for values in (centre.sizes, centre.errors))
-    # What is found: how much of the difference it explains, its cause, and what is said of a cause without a size.
+    sizes, errors = (
+        {k: v for k, v in values.items() if k == "centre"}
+        for values in (centre.sizes, centre.errors)
+    )
+    # What is found: how much of the difference it explains, its cause, and what is said of a cause
+    # without a size.
     ranked = [
         (explained / pairs.here.numel(), "centre" if "rotation centre" in text else "", text)
         for text in centre.findings[:1]
@@ -176,13 +205,15 @@ def geometry_test(
 def _measured(
     name: str, size: float, error: float, described: Callable[[float], RayPairs | None]
 ) -> tuple[float, float]:
-    """The size of an error, and its standard error, at which nothing is left of it (Gauss and Newton).
+    """The size of an error, and its standard error, at which nothing is left of it (Gauss and
+    Newton).
 
     The difference is of first order in the size only near 0.
 
     Args:
         size, error: of first order.
-        described: the readings as they are where an error of that size is taken out of the description.
+        described: the readings as they are where an error of that size is taken out of the
+            description.
     """
     total = size
     for _ in range(8):
@@ -209,18 +240,23 @@ def _described(geometry: Any, name: str, size: float) -> Any:
         turned = unwrapped(geometry.angles)
         return replace(geometry, angles=turned[0] + (1.0 + size) * (turned - turned[0]))
     cone = isinstance(geometry, ConeBeam)
-    pitch, offset = (geometry.pitch[1], geometry.offset[1]) if cone else (geometry.pitch, geometry.offset)
+    pitch, offset = (
+        (geometry.pitch[1], geometry.offset[1]) if cone else (geometry.pitch, geometry.offset)
+    )
     if name == "centre":
         offset = offset - size * pitch
     else:
         pitch, offset = (1.0 + size) * pitch, (1.0 + size) * offset
     if cone:
-        return replace(geometry, pitch=(geometry.pitch[0], pitch), offset=(geometry.offset[0], offset))
+        return replace(
+            geometry, pitch=(geometry.pitch[0], pitch), offset=(geometry.offset[0], offset)
+        )
     return replace(geometry, pitch=pitch, offset=offset)
 
 
 def _unrolled(lines: Tensor, geometry: Any, window: DetectorWindow | None, roll: float) -> Tensor:
-    """Readings ``(views, rows, columns)`` of a detector that is rolled by an angle in rad, between its columns."""
+    """Readings ``(views, rows, columns)`` of a detector that is rolled by an angle in rad,
+    between its columns."""
     first = 0 if window is None else window.first_row
     shifts = roll * geometry.row_positions[first : first + lines.shape[1]] / geometry.pitch[1]
     columns = lines.shape[2]
@@ -229,39 +265,53 @@ def _unrolled(lines: Tensor, geometry: Any, window: DetectorWindow | None, roll:
         at = np.clip(np.arange(columns) + shift, 0, columns - 1)
         low = np.minimum(at.astype(int), max(columns - 2, 0))
         turned.append(
-            torch.lerp(row[:, low], row[:, np.minimum(low + 1, columns - 1)], torch.from_numpy(at - low).to(row))
+            torch.lerp(
+                row[:, low],
+                row[:, np.minimum(low + 1, columns - 1)],
+                torch.from_numpy(at - low).to(row),
+            )
         )
     return torch.stack(turned, 1)
 
 
 def _centre_text(size: float, error: float) -> str:
     return (
-        f"opposite rays disagree: the geometry puts the columns about {abs(size):.2f} ± {error:.2g} columns too "
-        f"{'high' if size > 0 else 'low'}: the rotation centre (the detector's column offset) is wrong, or the object "
+        f"opposite rays disagree: the geometry puts the columns about {abs(size):.2f} ± "
+        f"{error:.2g} columns too "
+        f"{'high' if size > 0 else 'low'}: the rotation centre (the detector's column offset) is "
+        "wrong, or the object "
         "moved"
     )
 
 
 def _scale_text(size: float, error: float) -> str:
-    small, pitch, sdd = ("small", "larger", "smaller") if size > 0 else ("large", "smaller", "larger")
+    small, pitch, sdd = (
+        ("small", "larger", "smaller") if size > 0 else ("large", "smaller", "larger")
+    )
     return (
-        f"opposite rays disagree: the fan angles are described about {100 * abs(size):.2g} ± {100 * error:.1g} % too "
-        f"{small}: the column pitch is {pitch} than described, the distance source-detector (sdd) {sdd}, or the "
-        "detector is not flat or curved as described; sizes and values in the volume are wrong by as much"
+        f"opposite rays disagree: the fan angles are described about {100 * abs(size):.2g} ± "
+        f"{100 * error:.1g} % too "
+        f"{small}: the column pitch is {pitch} than described, the distance source-detector (sdd) "
+        f"{sdd}, or the "
+        "detector is not flat or curved as described; sizes and values in the volume are wrong by "
+        "as much"
     )
 
 
 def _step_text(size: float, error: float) -> str:
     return (
-        f"opposite rays disagree: the steps between the views are described about {100 * abs(size):.2g} ± "
-        f"{100 * error:.1g} % too {'small' if size > 0 else 'large'}: the range of the angles is wrong (a full turn?), "
+        "opposite rays disagree: the steps between the views are described about "
+        f"{100 * abs(size):.2g} ± "
+        f"{100 * error:.1g} % too {'small' if size > 0 else 'large'}: the range of the angles is "
+        "wrong (a full turn?), "
         "or views are missing"
     )
 
 
 def _roll_text(size: float, error: float) -> str:
     return (
-        f"opposite rays disagree, in higher rows the other way than in lower ones: the detector is rolled by about "
+        "opposite rays disagree, in higher rows the other way than in lower ones: the detector "
+        "is rolled by about "
         f"{math.degrees(abs(size)):.2g} ± {math.degrees(error):.1g}° against the rotation axis"
     )
 
@@ -273,15 +323,20 @@ def _mismatch_text(mismatch: float, strangers: bool, mirrored: bool) -> str:
     share = f"{100 * math.sqrt(mismatch):.0f} % of what changes from view to view"
     if mirrored:
         return (
-            f"opposite rays disagree by {share}, but not with the columns counted the other way: reverse the columns, "
+            f"opposite rays disagree by {share}, but not with the columns counted the other way: "
+            "reverse the columns, "
             "or the sign of the angles"
         )
     if strangers:
         return (
-            f"opposite rays have little in common (they disagree by {share}): the angles of the views (sign, range, "
+            f"opposite rays have little in common (they disagree by {share}): the angles of the "
+            "views (sign, range, "
             "order), the order of the columns or the axes of the data are wrong"
         )
-    return f"opposite rays disagree by {share}: the object moved, or the order or the angles of some views are wrong"
+    return (
+        f"opposite rays disagree by {share}: the object moved, or the order or the angles of "
+        "some views are wrong"
+    )
 
 
 def _centre(pairs: RayPairs, false_alarms: float) -> tuple[ScanTest, float]:
@@ -291,18 +346,23 @@ def _centre(pairs: RayPairs, false_alarms: float) -> tuple[ScanTest, float]:
         sums = pairs.sums(pairs.shifted(), columns)
         if sums is not None:
             turn = 2.0 * pairs.angles
-            waves = [_blocks(sums[1] * wave(turn), pairs.used(columns)) for wave in (np.cos, np.sin)]
+            waves = [
+                _blocks(sums[1] * wave(turn), pairs.used(columns)) for wave in (np.cos, np.sin)
+            ]
             score, power, bent = (_blocks(v, pairs.used(columns)) for v in sums)
             if power.sum() > 0:
                 design = np.stack([power, *waves], 1)
-                test = _tested(score, bent, design, false_alarms / len(_COLUMNS), pairs.aligned("centre"))
+                test = _tested(
+                    score, bent, design, false_alarms / len(_COLUMNS), pairs.aligned("centre")
+                )
                 found.append((test, test.sizes["centre"] ** 2 * float(power.sum())))
     return next((f for f in found if f[0].findings), found[0] if found else (UNKNOWN, 0.0))
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Size of one cause, its standard error, p-value against the tolerance, and the squared difference explained."""
+    """Size of one cause, its standard error, p-value against the tolerance, and the squared
+    difference explained."""
 
     size: float
     error: float
@@ -337,11 +397,12 @@ def _above(blocks: Floats) -> float:
 
 
 def _fitted(score: Floats, power: Floats, bent: Floats, tolerance: float, parted: float) -> _Fit:
-    """Regression of the blocks' scores on their powers, and Student's test of a size beyond the tolerance.
+    """Regression of the blocks' scores on their powers, and Student's test of a size beyond the
+    tolerance.
 
-    The scatter is that of sizes without one block each (the jackknife; MacKinnon and White 1985, J. Econometrics
-    29:305), its degrees of freedom those of as many equal blocks as the powers are worth (Satterthwaite 1946,
-    Biometrics Bull. 2:110): an edge may be seen by few views.
+    The scatter is that of sizes without one block each (the jackknife; MacKinnon and White 1985, J.
+    Econometrics 29:305), its degrees of freedom those of as many equal blocks as the powers are
+    worth (Satterthwaite 1946, Biometrics Bull. 2:110): an edge may be seen by few views.
 
     Args:
         bent: part of the scores that second order has taken off; half of it may be left.
@@ -356,7 +417,9 @@ def _fitted(score: Floats, power: Floats, bent: Floats, tolerance: float, parted
     freedom = 1.0 / float(np.square(share).sum()) - 1.0
     stray = 0.5 * abs(float(bent.sum())) / total + math.sqrt(parted / total)
     beyond = abs(size) - tolerance - stray
-    p_value = 2.0 * float(stats.t.sf(beyond / noise, freedom)) if freedom > 0 and beyond > 0 else 1.0
+    p_value = (
+        2.0 * float(stats.t.sf(beyond / noise, freedom)) if freedom > 0 and beyond > 0 else 1.0
+    )
     usual = float(stats.t.ppf(0.975, max(freedom, 1.0)) / stats.norm.ppf(0.975))
     error = math.sqrt((usual * noise) ** 2 + (stray / 2.0) ** 2 + (_KNOWN * tolerance) ** 2)
     return _Fit(size, error, min(p_value, 1.0), size**2 * total)
@@ -379,7 +442,8 @@ def _fits(pairs: RayPairs, name: str, tolerance: float) -> list[_Fit]:
 
 
 def _mismatch(pairs: RayPairs, false_alarms: float) -> tuple[float, int]:
-    """Share of the difference in what changes from view to view, and whether it is 1: too large, 2: nearly all."""
+    """Share of the difference in what changes from view to view, and whether it is 1: too large,
+    2: nearly all."""
     used = np.flatnonzero(pairs.known.flatten(1).any(1).numpy())
     if used.size < BLOCKS:
         return math.nan, 0
@@ -397,7 +461,8 @@ def _mismatch(pairs: RayPairs, false_alarms: float) -> tuple[float, int]:
     if signal.sum() <= 0:
         return math.nan, 0
     share = float(different.sum() / signal.sum())
-    # What interpolation between views leaves is no finding: a view from its neighbours is off by more than that.
+    # What interpolation between views leaves is no finding: a view from its neighbours is off by
+    # more than that.
     sampled = float(stray.sum() / signal.sum())
 
     def beyond(value: Floats, limit: float) -> bool:
@@ -410,7 +475,9 @@ def _mismatch(pairs: RayPairs, false_alarms: float) -> tuple[float, int]:
     return max(share, 0.0), grade
 
 
-def _tested(score: Floats, bent: Floats, design: Floats, false_alarms: float, parted: float) -> ScanTest:
+def _tested(
+    score: Floats, bent: Floats, design: Floats, false_alarms: float, parted: float
+) -> ScanTest:
     power = design[:, 0]
     fit = _fitted(score, power, bent, CENTRE_TOLERANCE, parted)
     # A wave has half the square of its amplitude.
@@ -420,7 +487,8 @@ def _tested(score: Floats, bent: Floats, design: Floats, false_alarms: float, pa
         findings.append(_centre_text(fit.size, 2.0 * fit.error))
     if swinging < false_alarms / 2:
         findings.append(
-            f"opposite rays disagree by {swing:.2f} columns to either side in the course of a turn: the object moved, "
+            f"opposite rays disagree by {swing:.2f} columns to either side in the course of a "
+            "turn: the object moved, "
             "or the angles of the views are wrong"
         )
     sizes = {"centre": fit.size} | ({} if math.isnan(swing) else {"swing": swing})
@@ -428,10 +496,11 @@ def _tested(score: Floats, bent: Floats, design: Floats, false_alarms: float, pa
 
 
 def _swing(score: Floats, bent: Floats, waves: Floats, parted: float) -> tuple[float, float]:
-    """Amplitude of the second and third of ``waves`` ``(blocks, 3)`` in the scores, and its p-value.
+    """Amplitude of the second and third of ``waves`` ``(blocks, 3)`` in the scores, and its
+    p-value.
 
-    Where a few blocks hold most of what is seen, theirs is what noise leaves: the likelier of the usual covariance
-    and that of the jackknife (MacKinnon and White 1985, J. Econometrics 29:305).
+    Where a few blocks hold most of what is seen, theirs is what noise leaves: the likelier of the
+    usual covariance and that of the jackknife (MacKinnon and White 1985, J. Econometrics 29:305).
 
     Args:
         bent: see :func:`_fitted`.
@@ -457,5 +526,7 @@ def _swing(score: Floats, bent: Floats, waves: Floats, parted: float) -> tuple[f
     if amplitude <= tolerance or freedom <= 0.0:
         return amplitude, 1.0
     rest = found[1:] * (1.0 - tolerance / amplitude)
-    statistic = min(rest @ np.linalg.solve(covariance[1:, 1:], rest) / 2.0 for covariance in (usual, jackknife))
+    statistic = min(
+        rest @ np.linalg.solve(covariance[1:, 1:], rest) / 2.0 for covariance in (usual, jackknife)
+    )
     return amplitude, float(stats.f.sf(statistic, 2, freedom))

@@ -1,15 +1,17 @@
 """The plane of a cone beam's orbit: the only rays that others meet again, as one row of a fan beam.
 
-Rows beside the plane are read, too, since cells have a height and noise is averaged. A ray at the height v of the
-detector passes the object at z = v (1 + s / sod) / M, s behind the axis, its opposite at v (1 - s / sod) / M. Over rows
-that lie evenly about the plane all that is odd in v cancels, a slope of the object along z first of all. Of what is
-even, e(v), the opposite rays of the mean over −V … V differ, to first order in s / sod, by
+Rows beside the plane are read, too, since cells have a height and noise is averaged. A ray at the
+height v of the detector passes the object at z = v (1 + s / sod) / M, s behind the axis, its
+opposite at v (1 - s / sod) / M. Over rows that lie evenly about the plane all that is odd in v
+cancels, a slope of the object along z first of all. Of what is even, e(v), the opposite rays of the
+mean over −V … V differ, to first order in s / sod, by
 
     2 (s / sod) · (e(V) - mean of e),
 
-integrating ∫ v e'(v) dv by parts: only what changes between the rows that are averaged and their border counts. An
-object that is the same in all rows has none of it, the face of a disc within the rows all. s is not known of a ray, but
-over the views it is what t = sod · sin γ is, so that a mean square is.
+integrating ∫ v e'(v) dv by parts: only what changes between the rows that are averaged and their
+border counts. An object that is the same in all rows has none of it, the face of a disc within the
+rows all. s is not known of a ray, but over the views it is what t = sod · sin γ is, so that a mean
+square is.
 """
 
 from __future__ import annotations
@@ -27,12 +29,15 @@ from torchpcct.geometry import ConeBeam
 __all__ = ["PARTED", "OrbitPlane", "lack_of_cells", "orbit_plane", "shared_square"]
 
 _FLAT_CELLS = 1.0
-"""Rows whose opposite rays part by more than so many of them at the border of the field are not averaged."""
+"""Rows whose opposite rays part by more than so many of them at the border of the field are not
+averaged."""
 PARTED = 2.5
-"""Times the mean square of what opposite rays part by, as it is here estimated, that they may differ: 2.1 times at most
-of 150 sound scans drawn at random (bodies beside the axis, parts of a turn, opaque ones)."""
+"""Times the mean square of what opposite rays part by, as it is here estimated, that they may
+differ: 2.1 times at most of 150 sound scans drawn at random (bodies beside the axis, parts of a
+turn, opaque ones)."""
 _NEEDED = 16.0
-"""Square of the standard errors of a finding: how many variances of noise weigh as much as what rays part by."""
+"""Square of the standard errors of a finding: how many variances of noise weigh as much as what
+rays part by."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +46,14 @@ class OrbitPlane:
 
     Attributes:
         lines: ``(views, 1, columns)``.
-        parted: mean square by which opposite rays of a sound scan may differ, since they part along z.
-        part: of the sum of a view, what changes between the rows and their border, or from row to row.
+        parted: mean square by which opposite rays of a sound scan may differ, since they part along
+            z.
+        part: of the sum of a view, what changes between the rows and their border, or from row to
+            row.
         away: root mean square distance of the object from the axis, over sod.
         rows: how many were averaged.
-        lacking: ``(views, columns)``, what they may lack because cells average transmissions (:func:`lack_of_cells`).
+        lacking: ``(views, columns)``, what they may lack because cells average transmissions
+            (:func:`lack_of_cells`).
     """
 
     lines: Tensor
@@ -56,7 +64,8 @@ class OrbitPlane:
     lacking: Tensor
 
     def turned(self, *, closed: bool) -> float:
-        """Relative change with the direction that the sum of a view may show, as the rays part along z.
+        """Relative change with the direction that the sum of a view may show, as the rays part
+        along z.
 
         Args:
             closed: over a full turn, what is of first order has another period than what is tested.
@@ -67,7 +76,8 @@ class OrbitPlane:
 def orbit_plane(lines: Tensor, geometry: ConeBeam) -> OrbitPlane | None:
     """The plane of the source as one row; None: no row lies in it.
 
-    As many rows are averaged as a test of the result gains by: the more, the less noise, and the farther the rays part.
+    As many rows are averaged as a test of the result gains by: the more, the less noise, and the
+    farther the rays part.
 
     Args:
         lines: line integrals ``(views, rows, columns)``.
@@ -92,22 +102,32 @@ def orbit_plane(lines: Tensor, geometry: ConeBeam) -> OrbitPlane | None:
         total, rows = total + float(counts[k]) * level, rows + int(counts[k])
         mean = total / rows
         border, guarded = _border(lines, geometry, heights[k] + row)
-        beside = [_row(lines, geometry, side * v) for v in (heights[k] - row, heights[k] + row) for side in (-1, 1)]
+        beside = [
+            _row(lines, geometry, side * v)
+            for v in (heights[k] - row, heights[k] + row)
+            for side in (-1, 1)
+        ]
         ends = [level] if border is None else [beside[2] - beside[0], beside[3] - beside[1]]
         steps = [e.double().numpy() for e in ends]
-        lacking += float(counts[k]) * torch.from_numpy(np.mean([lack_of_cells(step) for step in steps], axis=0))
+        lacking += float(counts[k]) * torch.from_numpy(
+            np.mean([lack_of_cells(step) for step in steps], axis=0)
+        )
         step = np.mean([_without_noise(step) for step in steps], axis=0)
         stepping += float(counts[k]) * float(np.minimum(step, np.abs(level.numpy())).mean())
         # Without rows beside them nobody knows where the object ends: all of it may.
         change = mean if border is None else border - mean
         square = shared_square(change)
         if border is not None:
-            square = max(square, shared_square((level - border) / 2), 0.0 if guarded else shared_square(mean))
+            square = max(
+                square, shared_square((level - border) / 2), 0.0 if guarded else shared_square(mean)
+            )
         away = _spread(change, off_axis) if square > 0 else 0.0
         parted = PARTED * 4.0 * square * away / geometry.sod**2
         if noise is None:
             # Of one row: the border is the mean of two, the first level of one or two.
-            noise = max(float(change.double().square().mean()) - shared_square(change), 0.0) / (0.5 + 1.0 / rows)
+            noise = max(float(change.double().square().mean()) - shared_square(change), 0.0) / (
+                0.5 + 1.0 / rows
+            )
         cost = _NEEDED * 2.0 * noise / rows + parted * mean.numel() / 2
         if best is None or cost < best[0]:
             sums, all_of_it = change.mean(1), float(mean.mean())
@@ -115,7 +135,10 @@ def orbit_plane(lines: Tensor, geometry: ConeBeam) -> OrbitPlane | None:
             ends_within = max(float(sums.abs().mean()), stepping / rows)
             share = ends_within / all_of_it if all_of_it > 0 else 1.0
             far = math.sqrt(_spread(mean, off_axis)) / geometry.sod
-            best = cost, OrbitPlane(mean[:, None], parted, min(share, 1.0), far, rows, lacking / rows)
+            best = (
+                cost,
+                OrbitPlane(mean[:, None], parted, min(share, 1.0), far, rows, lacking / rows),
+            )
     return None if best is None else best[1]
 
 
@@ -133,16 +156,23 @@ def _levels(geometry: ConeBeam) -> list[float]:
 
 
 def _border(lines: Tensor, geometry: ConeBeam, height: float) -> tuple[Tensor | None, bool]:
-    """What lies beside the rows up to a height, and whether it does on both sides; None: no row is there."""
+    """What lies beside the rows up to a height, and whether it does on both sides; None: no row
+    is there."""
     low, high = geometry.row_positions[0], geometry.row_positions[-1]
     reach = height - (0.5 + 1e-6) * geometry.pitch[0]
-    sides = [_row(lines, geometry, side * height) for side, end in ((-1, -low), (1, high)) if end >= reach]
+    sides = [
+        _row(lines, geometry, side * height)
+        for side, end in ((-1, -low), (1, high))
+        if end >= reach
+    ]
     return (sum(sides[1:], sides[0]) / len(sides) if sides else None), len(sides) == 2
 
 
 def _row(lines: Tensor, geometry: ConeBeam, height: float) -> Tensor:
     """``(views, columns)`` at a height on the detector, between its neighbours."""
-    at = float(np.clip((height - geometry.row_positions[0]) / geometry.pitch[0], 0, geometry.rows - 1))
+    at = float(
+        np.clip((height - geometry.row_positions[0]) / geometry.pitch[0], 0, geometry.rows - 1)
+    )
     near = round(at)
     if abs(at - near) < 1e-6:
         return lines[:, near]
@@ -153,9 +183,9 @@ def _row(lines: Tensor, geometry: ConeBeam, height: float) -> Tensor:
 def lack_of_cells(steps: NDArray[np.float64]) -> NDArray[np.float64]:
     """What line integrals may lack in cells in which the object ends, ``(views, columns)``.
 
-    The logarithm of a mean of transmissions lies below the mean of the line integrals: where they step by J from one
-    neighbour to the other, and the step covers the part q of the cell, by q J + ln(1 - q (1 - exp(-J))). Its maximum
-    over q is taken, J² / 8 of small steps.
+    The logarithm of a mean of transmissions lies below the mean of the line integrals: where they
+    step by J from one neighbour to the other, and the step covers the part q of the cell, by q J +
+    ln(1 - q (1 - exp(-J))). Its maximum over q is taken, J² / 8 of small steps.
 
     Args:
         steps: J, with noise that is independent from view to view.
@@ -173,9 +203,11 @@ def _without_noise(steps: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def shared_square(values: Tensor) -> float:
-    """Mean square of ``(views, columns)`` without its noise: products of neighbours, whose noise is independent.
+    """Mean square of ``(views, columns)`` without its noise: products of neighbours, whose noise is
+    independent.
 
-    A detail may be as narrow as a column, or wander on by more than itself from view to view: the larger of the two.
+    A detail may be as narrow as a column, or wander on by more than itself from view to view: the
+    larger of the two.
     """
     if min(values.shape) < 2:
         return float(values.double().square().mean())
@@ -185,7 +217,8 @@ def shared_square(values: Tensor) -> float:
 
 
 def _spread(values: Tensor, away: Tensor) -> float:
-    """Twice the mean square of the distances from the axis at which values are: that from the axis of their places."""
+    """Twice the mean square of the distances from the axis at which values are: that from the
+    axis of their places."""
     weight = (values[:, 1:] * values[:, :-1]).double().sum(0).clamp_min(0.0)
     if float(weight.sum()) <= 0:
         return float(away.square().max())

@@ -1,4 +1,5 @@
-"""Opposite rays: where they lie, what they read, and how both change along the columns and with the views.
+"""Opposite rays: where they lie, what they read, and how both change along the columns and with the
+views.
 
 The ray of source angle β and fan angle γ is met again by that of β + π − 2γ and −γ.
 """
@@ -27,16 +28,17 @@ BLOCKS = 24
 """Parts of the views whose scatter tells the error of a sum."""
 # Readings whose opposites are looked up; more only cost time.
 _MOST = 500_000
-# Views beside an opposite angle that are farther apart than so many usual steps do not stand for it.
+# Views beside an opposite angle that are farther apart than so many usual steps do not stand for
+# it.
 _GAP_STEPS = 3.0
 _ROWS = 9
 """Most rows over which slopes are smoothed."""
 _FLAT_CELLS = 2.0
 """Rows count whose opposite rays part by less, along z."""
 _ALIGNED = {"centre": 0.05, "step": 0.06, "scale": 0.25, "roll": 0.05}
-"""Share of the squared difference by which rays may part that looks like a cause at most: of 300 sound cone beams drawn
-at random, without noise, 0.021, 0.026, 0.056 and 0.009 (of two plates 0.13 and 0.61, as fan angles by more than a
-third)."""
+"""Share of the squared difference by which rays may part that looks like a cause at most: of 300
+sound cone beams drawn at random, without noise, 0.021, 0.026, 0.056 and 0.009 (of two plates 0.13
+and 0.61, as fan angles by more than a third)."""
 
 Floats = NDArray[np.float64]
 Pattern = tuple[Tensor, str]
@@ -62,7 +64,11 @@ class RayPairs:
 
     @classmethod
     def of(
-        cls, lines: Tensor, geometry: Geometry, window: DetectorWindow | None, about: tuple[float, float]
+        cls,
+        lines: Tensor,
+        geometry: Geometry,
+        window: DetectorWindow | None,
+        about: tuple[float, float],
     ) -> RayPairs | None:
         """Of a whole cone beam the plane of the source; None where no row lies near it."""
         if window is not None or not isinstance(geometry, ConeBeam):
@@ -76,9 +82,14 @@ class RayPairs:
 
     @classmethod
     def stacked(
-        cls, lines: Tensor, geometry: Geometry, window: DetectorWindow | None, about: tuple[float, float]
+        cls,
+        lines: Tensor,
+        geometry: Geometry,
+        window: DetectorWindow | None,
+        about: tuple[float, float],
     ) -> RayPairs | None:
-        """Of a cone beam the rows near the plane of the source, each with its own; None where there is none."""
+        """Of a cone beam the rows near the plane of the source, each with its own; None where
+        there is none."""
         window = DetectorWindow.full(geometry) if window is None else window
         _check(lines, geometry, window)
         values = lines.detach().to("cpu", torch.float32).reshape(window.shape)
@@ -105,7 +116,8 @@ class RayPairs:
         return torch.from_numpy(height - height.mean()).float() / g.pitch[1]
 
     def pattern(self, name: str) -> Pattern | None:
-        """Of one cause (``centre``, ``roll``, ``scale`` or ``step``) of the size 1; None: the scan cannot show it."""
+        """Of one cause (``centre``, ``roll``, ``scale`` or ``step``) of the size 1; None: the
+        scan cannot show it."""
         if name == "centre":
             return self.shifted()
         if name == "roll":
@@ -120,14 +132,18 @@ class RayPairs:
         else:
             turned = unwrapped(self.rays.geometry.angles)
             places, _ = self.rays.places(self.base)
-            factor = sum(part * turned[views] for views, part, *_ in places) - turned[self.base][:, None]
+            factor = (
+                sum(part * turned[views] for views, part, *_ in places) - turned[self.base][:, None]
+            )
         return torch.from_numpy(factor)[:, None].float(), "angles"
 
     def whole(self, columns: int) -> Tensor:
         """A slope reaches over neighbours: all of them must have an opposite."""
         if columns not in self._whole:
             known = -self.known.float()[:, None]
-            self._whole[columns] = -F.max_pool2d(known, (1, 2 * columns + 1), 1, (0, columns))[:, 0] > 0.5
+            self._whole[columns] = (
+                -F.max_pool2d(known, (1, 2 * columns + 1), 1, (0, columns))[:, 0] > 0.5
+            )
         return self._whole[columns]
 
     def used(self, columns: int) -> NDArray[np.int64]:
@@ -137,7 +153,8 @@ class RayPairs:
         """Smoothed slopes of both rays, raw ones of both, and where they are known."""
         if (along, columns) not in self._slopes:
             pairs = [
-                [_slope(v, *size) for v in (self.here, self.opposite)] for size in ((_ROWS, columns), (1, columns // 5))
+                [_slope(v, *size) for v in (self.here, self.opposite)]
+                for size in ((_ROWS, columns), (1, columns // 5))
             ]
             known = self.whole(columns)
             if along == "angles":
@@ -151,7 +168,8 @@ class RayPairs:
         return self._slopes[along, columns]
 
     def beside(self) -> Any:
-        """The views before and behind, the angle between them, and the columns that a window moves per rad."""
+        """The views before and behind, the angle between them, and the columns that a window
+        moves per rad."""
         if self._beside is None:
             n, turn = self._order.size, self.rays.geometry.angles % (2 * math.pi)
             ends = [self._order[(self._at + k) % n] for k in (-1, 1)]
@@ -163,12 +181,15 @@ class RayPairs:
             looked = [self._look(e) for e in ends]
             mask = torch.from_numpy(good)[:, None, None]
             sides = [(*part[:2], part[2] & mask) for part in looked]
-            self._beside = sides, *(torch.from_numpy(v)[:, None, None].float() for v in (step, rate))
+            self._beside = (
+                sides,
+                *(torch.from_numpy(v)[:, None, None].float() for v in (step, rate)),
+            )
         return self._beside
 
     def sums(self, pattern: Pattern, columns: int) -> tuple[Floats, Floats, Floats] | None:
-        """Score and power of a pattern in every view, and which part of the score interpolation would have left had it
-        been in straight lines; None: too few views."""
+        """Score and power of a pattern in every view, and which part of the score interpolation
+        would have left had it been in straight lines; None: too few views."""
         if self.used(columns).size < BLOCKS:
             return None
         factor, along = pattern
@@ -176,7 +197,9 @@ class RayPairs:
         slope = factor * (smooth[0] + smooth[1]) / 2
         power = factor.square() * (smooth[0] * raw[1] + smooth[1] * raw[0]) / 2
         values = (-self.residue * slope, power, -self.curvature * slope)
-        score, power, bent = (torch.where(known, v, 0.0).double().sum((1, 2)).numpy() for v in values)
+        score, power, bent = (
+            torch.where(known, v, 0.0).double().sum((1, 2)).numpy() for v in values
+        )
         return score, power, bent
 
     def between_views(self) -> Tensor:
@@ -197,10 +220,12 @@ class RayPairs:
 
     @cached_property
     def blurred(self) -> float:
-        """Squared difference, noise taken off, that cells and the focal spot may leave where rays spread.
+        """Squared difference, noise taken off, that cells and the focal spot may leave where rays
+        spread.
 
-        They average over more of the object behind the axis than before it, s / sod of the width at the axis either
-        way: of the second difference D from column to column s / (6 sod) by the cells, as much again by the spot.
+        They average over more of the object behind the axis than before it, s / sod of the width at
+        the axis either way: of the second difference D from column to column s / (6 sod) by the
+        cells, as much again by the spot.
         """
         if self.rays.parallel:
             return 0.0
@@ -212,7 +237,8 @@ class RayPairs:
         return max(square, 0.0) * (reach / 3.0) ** 2
 
     def aligned(self, name: str) -> float:
-        """Of the squared difference that rays part by or that blur leaves, what may look like one cause."""
+        """Of the squared difference that rays part by or that blur leaves, what may look like
+        one cause."""
         return _ALIGNED[name] * (self.parted + self.blurred)
 
     @property
@@ -221,7 +247,8 @@ class RayPairs:
         return float(product(self.difference, self.known).sum()) / self.here.numel()
 
     def agrees_mirrored(self, most: float) -> bool:
-        """Whether the rays disagree by less than ``most`` if the columns are counted the other way."""
+        """Whether the rays disagree by less than ``most`` if the columns are counted the other
+        way."""
         g, w = self.rays.geometry, self.rays.window
         if w.columns != g.columns:
             return False
@@ -232,7 +259,8 @@ class RayPairs:
 
 
 def unwrapped(angles: Floats) -> Floats:
-    """Angles as the scanner turned, where they are given from 0 to 2π; views in no order stay as they are."""
+    """Angles as the scanner turned, where they are given from 0 to 2π; views in no order stay as
+    they are."""
     turned: Floats = np.unwrap(angles)
     steps = np.diff(turned)
     return turned if bool((steps > 0).all() or (steps < 0).all()) else angles
@@ -244,20 +272,29 @@ def _check(lines: Tensor, geometry: Geometry, window: DetectorWindow) -> None:
 
 
 def product(values: Tensor, known: Tensor) -> Floats:
-    """Sum of the products of close columns in every view, whose noise is independent: squares without noise.
+    """Sum of the products of close columns in every view, whose noise is independent: squares
+    without noise.
 
     Interpolation between columns makes next ones share a reading, not those three apart.
     """
     both = known[..., 3:] & known[..., :-3]
-    products: Floats = torch.where(both, values[..., 3:] * values[..., :-3], 0.0).double().sum((1, 2)).numpy()
+    products: Floats = (
+        torch.where(both, values[..., 3:] * values[..., :-3], 0.0).double().sum((1, 2)).numpy()
+    )
     return products
 
 
-def _flat_part(geometry: ConeBeam, window: DetectorWindow, values: Tensor) -> tuple[DetectorWindow, Tensor]:
-    """The rows whose opposite rays part by less than :data:`_FLAT_CELLS` over what the window shows."""
+def _flat_part(
+    geometry: ConeBeam, window: DetectorWindow, values: Tensor
+) -> tuple[DetectorWindow, Tensor]:
+    """The rows whose opposite rays part by less than :data:`_FLAT_CELLS` over what the window
+    shows."""
     row, column = geometry.pitch
     reach = window.columns * column / geometry.magnification / 2
-    flat = np.abs(geometry.row_positions) <= max(0.5 * _FLAT_CELLS, _FLAT_CELLS * geometry.sod / reach) * row + 1e-9
+    flat = (
+        np.abs(geometry.row_positions)
+        <= max(0.5 * _FLAT_CELLS, _FLAT_CELLS * geometry.sod / reach) * row + 1e-9
+    )
     kept = np.flatnonzero(flat[window.first_row : window.first_row + window.rows])
     if kept.size == 0:
         return window, values[:, :0]
@@ -265,35 +302,48 @@ def _flat_part(geometry: ConeBeam, window: DetectorWindow, values: Tensor) -> tu
     return window.with_rows(window.first_row + first, count), values[:, first : first + count]
 
 
-def _parted(geometry: ConeBeam, window: DetectorWindow, values: Tensor, about: tuple[float, float]) -> float:
-    """Mean square by which opposite rays of rows ``(views, rows, columns)`` may differ, since they part along z.
+def _parted(
+    geometry: ConeBeam, window: DetectorWindow, values: Tensor, about: tuple[float, float]
+) -> float:
+    """Mean square by which opposite rays of rows ``(views, rows, columns)`` may differ, since they
+    part along z.
 
-    To first order by 2 (s / sod) v ∂p/∂v (:mod:`torchpcct.checks.orbit_plane`), v the height of the row.
+    To first order by 2 (s / sod) v ∂p/∂v (:mod:`torchpcct.checks.orbit_plane`), v the height of the
+    row.
     """
     rays = OppositeRays(geometry, window, about)
     if values.shape[1] < 2:
         return 0.0
     turn = geometry.angles
     off = geometry.sod * np.sin(rays.fan_angles(np.arange(turn.size)) - rays.path(turn)[0][:, None])
-    height = geometry.row_positions[window.first_row : window.first_row + window.rows] / geometry.pitch[0]
+    height = (
+        geometry.row_positions[window.first_row : window.first_row + window.rows]
+        / geometry.pitch[0]
+    )
     height = torch.from_numpy((height[1:] + height[:-1]) / 2)[:, None].float()
-    steps = height * values.diff(dim=1) * torch.from_numpy(2.0 * off / geometry.sod)[:, None].float()
+    steps = (
+        height * values.diff(dim=1) * torch.from_numpy(2.0 * off / geometry.sod)[:, None].float()
+    )
     return PARTED * float(np.mean([shared_square(part) for part in steps.unbind(1)]))
 
 
 def _joined_rows(geometry: ConeBeam, window: DetectorWindow, values: Tensor) -> Any:
-    """Means over neighbouring rows, so many that the readings are :data:`_MOST` if three rows are left of them."""
+    """Means over neighbouring rows, so many that the readings are :data:`_MOST` if three rows
+    are left of them."""
     join = min(math.ceil(values.numel() / _MOST), max(window.rows // 3, 1))
     rows, (pitch, column) = window.rows // join, geometry.pitch
     values = values[:, : rows * join].unflatten(1, (rows, join)).mean(2)
     first = geometry.row_positions[window.first_row]
     middle = float(first + (rows * join - 1) / 2 * pitch)
-    wider = replace(geometry, rows=rows, pitch=(join * pitch, column), offset=(middle, geometry.offset[1]))
+    wider = replace(
+        geometry, rows=rows, pitch=(join * pitch, column), offset=(middle, geometry.offset[1])
+    )
     return wider, window.with_rows(0, rows), values
 
 
 def _slope(values: Tensor, rows: int, columns: int) -> Tensor:
-    """Central difference along the columns, averaged over ``rows`` (of a smaller stack less) × ``columns`` (odd)."""
+    """Central difference along the columns, averaged over ``rows`` (of a smaller stack less) ×
+    ``columns`` (odd)."""
     kernel = torch.zeros(columns + 2)
     for k in range(columns):
         kernel[k] -= 0.5
@@ -328,11 +378,14 @@ class OppositeRays:
     def fan_angles(self, views: NDArray[np.int64]) -> Floats:
         """Of the readings of some views, ``(views, columns)`` rad; parallel: position in mm."""
         g = self.geometry
-        found: Floats = (g.column_positions if self.parallel else g.fan_angles)[self.window.column_indices[views]]
+        found: Floats = (g.column_positions if self.parallel else g.fan_angles)[
+            self.window.column_indices[views]
+        ]
         return found
 
     def path(self, beta: Floats) -> tuple[Floats, Floats]:
-        """Fan angle (parallel: position in mm) of the point that is followed, and its depth from the source."""
+        """Fan angle (parallel: position in mm) of the point that is followed, and its depth from
+        the source."""
         across = self.radius * np.sin(self.polar - beta)
         if self.parallel:
             return across, np.ones_like(across)
@@ -341,7 +394,8 @@ class OppositeRays:
         return np.arctan2(across, depth), np.hypot(across, depth) if curved else depth
 
     def opposite(self, values: Tensor, base: NDArray[np.int64]) -> tuple[Tensor, Tensor]:
-        """The opposite of every reading ``(base, rows, columns)`` of the views ``base``, and where it was measured.
+        """The opposite of every reading ``(base, rows, columns)`` of the views ``base``, and where
+        it was measured.
 
         Each pair counts once, with its ray of positive fan angle.
         """
@@ -354,14 +408,17 @@ class OppositeRays:
         return total, known
 
     def curvature(self, values: Tensor, base: NDArray[np.int64], between: Tensor) -> Tensor:
-        """By how much :meth:`opposite` is too low, to second order, since it is interpolated in straight lines.
+        """By how much :meth:`opposite` is too low, to second order, since it is interpolated in
+        straight lines.
 
-        A second difference D from neighbour to neighbour leaves -s (1 - s) D / 2 at the part s of the way.
+        A second difference D from neighbour to neighbour leaves -s (1 - s) D / 2 at the part s of
+        the way.
 
         Args:
             values, base: see :meth:`opposite`.
-            between: ``(base, rows, columns)``, how far the readings themselves lie from the mean of those in the views
-                before and behind, -D / 2 along the views, which their opposites share.
+            between: ``(base, rows, columns)``, how far the readings themselves lie from the mean of
+                those in the views before and behind, -D / 2 along the views, which their opposites
+                share.
         """
         bend = F.pad(values[..., 2:] - 2.0 * values[..., 1:-1] + values[..., :-2], (1, 1))
         places, known = self.places(base)
@@ -369,12 +426,17 @@ class OppositeRays:
         for views, part, row, column in places:
             way = column - np.floor(column)
             part = part * -0.5 * way * (1.0 - way)
-            total += torch.from_numpy(part)[:, None].float() * _bilinear(bend, views, row, column)[0]
+            total += (
+                torch.from_numpy(part)[:, None].float() * _bilinear(bend, views, row, column)[0]
+            )
         share = places[1][1]
         return total + torch.from_numpy(share * (1.0 - share))[:, None].float() * between
 
-    def places(self, base: NDArray[np.int64]) -> tuple[list[tuple[NDArray[np.int64], Floats, Floats, Floats]], Tensor]:
-        """The two views that opposites lie between, the part, row and column of each; and which rays have a pair.
+    def places(
+        self, base: NDArray[np.int64]
+    ) -> tuple[list[tuple[NDArray[np.int64], Floats, Floats, Floats]], Tensor]:
+        """The two views that opposites lie between, the part, row and column of each; and which
+        rays have a pair.
 
         Views and parts are ``(base, columns)``.
         """
@@ -385,7 +447,10 @@ class OppositeRays:
         beta = turn[base][:, None] + math.pi - (0.0 if self.parallel else 2.0) * gamma
         after = np.searchsorted(turn[order], beta % (2 * math.pi)) % turn.size
         ends = [order[after - 1], order[after]]
-        before, behind = ((beta - turn[ends[0]]) % (2 * math.pi), (turn[ends[1]] - beta) % (2 * math.pi))
+        before, behind = (
+            (beta - turn[ends[0]]) % (2 * math.pi),
+            (turn[ends[1]] - beta) % (2 * math.pi),
+        )
         share = before / np.maximum(before + behind, 1e-12)
         close = before + behind <= _GAP_STEPS * view_step(g.angles) + 1e-9
         known = torch.from_numpy((gamma > 0) & close)[:, None].expand(-1, w.rows, -1).clone()
@@ -398,22 +463,33 @@ class OppositeRays:
             flat = not self.parallel and g.detector == "flat"
             position = angle if self.parallel else g.sdd * (np.tan(angle) if flat else angle)
             column = (position - self.start) / self.step - w.first_column[views]
-            height = self.rows[w.first_row : w.first_row + w.rows][:, None] * (own_depth / depth)[:, None]
+            height = (
+                self.rows[w.first_row : w.first_row + w.rows][:, None]
+                * (own_depth / depth)[:, None]
+            )
             pitch = self.rows[1] - self.rows[0] if self.rows.size > 1 else 1.0
             places.append((views, part, (height - self.rows[0]) / pitch - w.first_row, column))
         return places, known
 
 
-def _bilinear(values: Tensor, views: NDArray[np.int64], row: Floats, column: Floats) -> tuple[Tensor, Tensor]:
-    """``values[views, row, column]`` between rows and columns, ``(base, rows, columns)``, and what lies inside."""
+def _bilinear(
+    values: Tensor, views: NDArray[np.int64], row: Floats, column: Floats
+) -> tuple[Tensor, Tensor]:
+    """``values[views, row, column]`` between rows and columns, ``(base, rows, columns)``, and
+    what lies inside."""
     rows, columns = values.shape[1:]
     inside = torch.from_numpy((column >= 0) & (column <= columns - 1))[:, None]
     inside = inside & torch.from_numpy((row >= -0.5) & (row <= rows - 0.5))
     at = torch.from_numpy(np.clip(column, 0, columns - 1))[:, None]
     up = torch.from_numpy(np.clip(row, 0, rows - 1))
     view = torch.from_numpy(views)[:, None]
-    left, low = at.floor().long().clamp(max=max(columns - 2, 0)), up.floor().long().clamp(max=max(rows - 2, 0))
+    left, low = (
+        at.floor().long().clamp(max=max(columns - 2, 0)),
+        up.floor().long().clamp(max=max(rows - 2, 0)),
+    )
     right, high = (left + 1).clamp(max=columns - 1), (low + 1).clamp(max=rows - 1)
     across, along = (at - left).float(), (up - low).float()
-    lower, upper = (torch.lerp(values[view, r, left], values[view, r, right], across) for r in (low, high))
+    lower, upper = (
+        torch.lerp(values[view, r, left], values[view, r, right], across) for r in (low, high)
+    )
     return torch.lerp(lower, upper, along), inside

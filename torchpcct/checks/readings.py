@@ -1,10 +1,12 @@
-"""Checks of readings by themselves: too bright, clipped, above an offset, almost no signal, or no counts at all.
+"""Checks of readings by themselves: too bright, clipped, above an offset, almost no signal, or no
+counts at all.
 
-The description of a scan can be wrong in ways that no shape or sign shows, and FBP reconstructs it all the same: water
-of -750 HU from transmissions given as counts. What speaks against a description is in the readings: air beside the
-object reads as air does; photons have the noise of photons, which an offset has not; a full well reads the same again
-and again; and no body is darkest at its edge. What the readings do not show, nobody can know from them: a wrong
-``mu_water`` or pitch, a dark offset or scatter behind a round body in the middle.
+The description of a scan can be wrong in ways that no shape or sign shows, and FBP reconstructs it
+all the same: water of -750 HU from transmissions given as counts. What speaks against a description
+is in the readings: air beside the object reads as air does; photons have the noise of photons,
+which an offset has not; a full well reads the same again and again; and no body is darkest at its
+edge. What the readings do not show, nobody can know from them: a wrong ``mu_water`` or pitch, a
+dark offset or scatter behind a round body in the middle.
 """
 
 from __future__ import annotations
@@ -21,14 +23,17 @@ from torchpcct.scan import Scan
 __all__ = ["reading_warnings"]
 
 AIR_TOLERANCE = 0.015
-"""Line integral of air below which the beam, or its calibration, is not that of the scan; 0.5 HU in 30 cm of water."""
+"""Line integral of air below which the beam, or its calibration, is not that of the scan; 0.5 HU
+in 30 cm of water."""
 STARVED_SHARE = 0.05
 """Share of readings without light from which a volume is wrong for it."""
 CLIPPED_SHARE = 0.005
 """Share of clipped readings from which a volume is wrong for it."""
-OFFSET_SHARE, OFFSET_SIGMAS = 0.05, 4.5
+OFFSET_SHARE = 0.05
+OFFSET_SIGMAS = 4.5
 """Offset, over the darkest readings, from which it is named; and how well it must be known."""
-_LEAST_COLUMNS, _LEAST_VIEWS = 24, 16
+_LEAST_COLUMNS = 24
+_LEAST_VIEWS = 16
 _MOST = 4_000_000
 
 
@@ -36,7 +41,8 @@ def reading_warnings(scan: Scan) -> list[str]:
     """What the readings of a noisy scan say against its description.
 
     Args:
-        scan: of any geometry, without energy bins. What was acquired with a known surround is only tested for light.
+        scan: of any geometry, without energy bins. What was acquired with a known surround is only
+            tested for light.
 
     Returns:
         One sentence for each finding; empty if there is none.
@@ -80,7 +86,8 @@ def _without_light(scan: Scan) -> list[str]:
     if share <= STARVED_SHARE:
         return []
     return [
-        f"{100 * share:.2g} % of the rays leave less than {FEWEST:g} photons a reading: how dark they are the data do "
+        f"{100 * share:.2g} % of the rays leave less than {FEWEST:g} photons a reading: how dark "
+        "they are the data do "
         "not say, and what they pass reads too low; raise the exposure, or bin the readings"
     ]
 
@@ -90,16 +97,20 @@ def _no_counts(lines: NDArray[np.float64]) -> list[str]:
     bright = float((lines < -math.log(1.5)).mean())
     if bright > 0.05:
         return [
-            f"{100 * bright:.0f} % of the readings are more than 1.5 times as bright as air: air, gain or flux are not "
-            "those of the scan, or these are line integrals given as counts (Scan.from_line_integrals takes them)"
+            f"{100 * bright:.0f} % of the readings are more than 1.5 times as bright as air: air, "
+            "gain or flux are not "
+            "those of the scan, or these are line integrals given as counts "
+            "(Scan.from_line_integrals takes them)"
         ]
     quarter = lines.shape[-1] // 4
     ends = min(float(np.nanmean(side)) for side in _ends(lines))
     middle = float(np.nanmedian(lines[..., quarter:-quarter]))
     if ends > max(1.3 * middle + 0.1, 0.5 * float(np.nanquantile(lines[::4], 0.9))):
         return [
-            f"the rays at both ends of the rows are the darkest (line integrals of {ends:.2g}, in the middle "
-            f"{middle:.2g}): these are transmissions or counts given as line integrals, or line integrals given as "
+            f"the rays at both ends of the rows are the darkest (line integrals of {ends:.2g}, in "
+            "the middle "
+            f"{middle:.2g}): these are transmissions or counts given as line integrals, or line "
+            "integrals given as "
             "counts"
         ]
     return []
@@ -116,8 +127,10 @@ def _brighter_than_air(lines: NDArray[np.float64]) -> list[str]:
     if not size < -max(AIR_TOLERANCE, 5.0 * spread):
         return []
     return [
-        f"the rays beside the object are {100 * math.expm1(-size):.2g} % brighter than air: an offset (dark=) or "
-        "scatter adds to the readings, or the beam is not that of the air frame (flux=); the object reads too low"
+        f"the rays beside the object are {100 * math.expm1(-size):.2g} % brighter than air: an "
+        "offset (dark=) or "
+        "scatter adds to the readings, or the beam is not that of the air frame (flux=); the "
+        "object reads too low"
     ]
 
 
@@ -136,7 +149,8 @@ def _mean(values: NDArray[np.float64], axes: tuple[int, ...]) -> NDArray[np.floa
 
 
 def _clipped(counts: NDArray[np.float64], quantum: float) -> list[str]:
-    """Readings that stop at the detector's full well: the highest of a cell comes again and again."""
+    """Readings that stop at the detector's full well: the highest of a cell comes again and
+    again."""
     columns = counts.shape[-1]
     views = counts.shape[0]
     highest = np.nanmax(np.where(np.isnan(counts), -np.inf, counts), axis=0)
@@ -146,7 +160,8 @@ def _clipped(counts: NDArray[np.float64], quantum: float) -> list[str]:
     share = float((at_top & often).sum()) / counts.size
     if share < CLIPPED_SHARE:
         return []
-    # Below, there must be noise: white, of more than one step of the digits, and more than the highest readings have.
+    # Below, there must be noise: white, of more than one step of the digits, and more than the
+    # highest readings have.
     second = counts[..., 2:] - 2.0 * counts[..., 1:-1] + counts[..., :-2]
     flat = at_top & often
     free = ~(flat[..., 2:] | flat[..., 1:-1] | flat[..., :-2]) & np.isfinite(second)
@@ -158,23 +173,37 @@ def _clipped(counts: NDArray[np.float64], quantum: float) -> list[str]:
     a, b = second[..., 1:][both], second[..., :-1][both]
     limit = 5.0 * np.median(np.abs(a)) + 1e-300  # edges are no noise
     small = (np.abs(a) < limit) & (np.abs(b) < limit)
-    white = float((a * b)[small].sum() / max(float(np.sqrt((a * a)[small].sum() * (b * b)[small].sum())), 1e-300))
+    white = float(
+        (a * b)[small].sum()
+        / max(float(np.sqrt((a * a)[small].sum() * (b * b)[small].sum())), 1e-300)
+    )
     noise = MEDIAN_TO_SD * float(np.median(np.abs(second[upper]))) / math.sqrt(6.0)
-    digits = [np.diff(np.unique(counts[:, r, c])) for r in (0,) for c in range(0, columns, max(1, columns // 16))]
-    step = float(np.median([d.min() for d in digits if d.size])) if any(d.size for d in digits) else 0.0
+    digits = [
+        np.diff(np.unique(counts[:, r, c]))
+        for r in (0,)
+        for c in range(0, columns, max(1, columns // 16))
+    ]
+    step = (
+        float(np.median([d.min() for d in digits if d.size]))
+        if any(d.size for d in digits)
+        else 0.0
+    )
     if white > -0.1 or noise < 2.0 * step:
         return []
     return [
-        f"{100 * share:.2g} % of the readings stop at the highest value of their cell: the detector is saturated, and "
-        "the thin parts of the object read too low; lower the exposure, or mask those readings by dead="
+        f"{100 * share:.2g} % of the readings stop at the highest value of their cell: the "
+        "detector is saturated, and "
+        "the thin parts of the object read too low; lower the exposure, or mask those readings by "
+        "dead="
     ]
 
 
 def _offset(counts: NDArray[np.float64], quantum: float) -> list[str]:
     """Readings over an offset: their noise is that of fewer photons than they count.
 
-    The variance of readings m, from the differences between views, is F (m - D) + c m²: F is the signal of a
-    photon, D the offset, and c what details of the object add (Janesick 2007, with the object in the beam).
+    The variance of readings m, from the differences between views, is F (m - D) + c m²: F is the
+    signal of a photon, D the offset, and c what details of the object add (Janesick 2007, with the
+    object in the beam).
     """
     # From view to view: there details change least, and cells of a scintillator share no light.
     mean, variance, number = _transfer(np.moveaxis(counts, 0, -1), np.nanquantile(counts, _CLASSES))
@@ -197,30 +226,44 @@ def _offset(counts: NDArray[np.float64], quantum: float) -> list[str]:
         many[np.flatnonzero(many)[int(left.argmax())]] = False  # edges
     else:
         return []
-    photon, product, spread = fit[0] / scale[0], fit[1] / scale[1], math.sqrt(inverse[1, 1]) / scale[1]
+    photon, product, spread = (
+        fit[0] / scale[0],
+        fit[1] / scale[1],
+        math.sqrt(inverse[1, 1]) / scale[1],
+    )
     # Else it is not the noise of photons that was found.
-    explained = 0.3 < photon / quantum < 1.5 and float(np.square(left).mean()) < 2.0 and m[-1] > 3.0 * m[0]
+    explained = (
+        0.3 < photon / quantum < 1.5 and float(np.square(left).mean()) < 2.0 and m[-1] > 3.0 * m[0]
+    )
     if not explained or product < OFFSET_SIGMAS * spread or product / photon < OFFSET_SHARE * m[0]:
         return []
-    # What details add to the noise of the brighter readings bends the curve, too: the dark ones must lack some.
+    # What details add to the noise of the brighter readings bends the curve, too: the dark ones
+    # must lack some.
     ratio, third = v / (m * quantum), max(len(m) // 3, 1)
-    dark, bright = float(np.average(ratio[:third], weights=number[many][:third])), float(np.median(ratio[-third:]))
+    dark, bright = (
+        float(np.average(ratio[:third], weights=number[many][:third])),
+        float(np.median(ratio[-third:])),
+    )
     sure = OFFSET_SIGMAS * dark * 3.5 / math.sqrt(float(number[many][:third].sum()))
     if dark + sure > (1.0 - OFFSET_SHARE / 2) * min(1.0, bright):
         return []
     return [
-        f"the darkest readings have less noise than photons can have: as over an offset of {product / photon:.2g} (the "
-        f"darkest read {m[0]:.2g}); give dark=, and air= of the same detector, or the object reads too low"
+        "the darkest readings have less noise than photons can have: as over an offset of "
+        f"{product / photon:.2g} (the "
+        f"darkest read {m[0]:.2g}); give dark=, and air= of the same detector, or the object "
+        "reads too low"
     ]
 
 
-_CLASSES, _LEAST_CLASSES = np.linspace(0.0, 1.0, 25), 12
+_CLASSES = np.linspace(0.0, 1.0, 25)
+_LEAST_CLASSES = 12
 
 
 def _transfer(
     n: NDArray[np.float64], edges: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Mean, variance (between neighbours on the last axis) and number of the readings between ``edges``."""
+    """Mean, variance (between neighbours on the last axis) and number of the readings between
+    ``edges``."""
     second = n[..., 2:] - 2.0 * n[..., 1:-1] + n[..., :-2]
     mean = (n[..., 2:] + n[..., 1:-1] + n[..., :-2]) / 3.0
     known = np.isfinite(second)
@@ -230,7 +273,14 @@ def _transfer(
     parts = np.split(order, np.searchsorted(at[order], np.arange(1, len(edges) - 1)))
     # Over √m, so that the dimmer ones of a class do not count for more.
     second /= np.sqrt(np.maximum(6.0 * mean, 1e-300))
-    found = [(mean[p].mean(), (np.subtract(*np.quantile(second[p], (0.75, 0.25))) / 1.349) ** 2 * mean[p].mean())
-             if p.size else (0.0, 0.0) for p in parts]  # fmt: skip
+    found = [
+        (
+            mean[p].mean(),
+            (np.subtract(*np.quantile(second[p], (0.75, 0.25))) / 1.349) ** 2 * mean[p].mean(),
+        )
+        if p.size
+        else (0.0, 0.0)
+        for p in parts
+    ]
     m, v = np.array(found).T
     return m, v, np.array([p.size for p in parts])

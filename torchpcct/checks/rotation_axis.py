@@ -1,12 +1,14 @@
 """Where is the rotation axis? Found from the readings, with an error that contains the truth.
 
-* Opposite rays that were measured see one line: of a full turn of any beam, or what a scan covers twice
-  (:mod:`torchpcct.checks.opposite_rays`). What all views of a full turn share is taken off before: the mean over the
-  turn is the same on both sides of the axis, gains of single cells are not.
-* Of half a turn of parallel rays the ends meet: the first views, mirrored, go on where the last ones stop.
-* There, too, the centroid of an object that is seen whole runs through the views as a sine about the axis (Helgason and
-  Ludwig's condition of first order). Gains of single cells pull it aside in all views alike, so that they are part of
-  its error.
+* Opposite rays that were measured see one line: of a full turn of any beam, or what a scan covers
+  twice (:mod:`torchpcct.checks.opposite_rays`). What all views of a full turn share is taken off
+  before: the mean over the turn is the same on both sides of the axis, gains of single cells are
+  not.
+* Of half a turn of parallel rays the ends meet: the first views, mirrored, go on where the last
+  ones stop.
+* There, too, the centroid of an object that is seen whole runs through the views as a sine about
+  the axis (Helgason and Ludwig's condition of first order). Gains of single cells pull it aside in
+  all views alike, so that they are part of its error.
 """
 
 from __future__ import annotations
@@ -30,26 +32,32 @@ from torchpcct.readings import MEDIAN_TO_SD
 
 __all__ = ["RotationAxis", "at_axis", "axis_column", "rotation_axis"]
 
-LEAST, LEAST_HALF = 0.02, 0.05
-"""Error in columns below which none is stated, of opposite rays and of half a turn: interpolation between views."""
+LEAST = 0.02
+LEAST_HALF = 0.05
+"""Error in columns below which none is stated, of opposite rays and of half a turn:
+interpolation between views."""
 _SIGMAS = 3.0
-_COARSE_VIEWS, _COARSE_STEPS = 48, 64
+_COARSE_VIEWS = 48
+_COARSE_STEPS = 64
 _REACH = 0.45
 """Part of the detector's width, to either side of its middle, where the axis is looked for."""
 _COMPARED = 0.1
-_LIKE_SIGMAS, _PART = 5.0, 8
-"""How much more than noise opposite rays must resemble each other at the axis (of a hundred columns that are tried one
-shows three by chance), and over how many columns products are summed."""
+_LIKE_SIGMAS = 5.0
+_PART = 8
+"""How much more than noise opposite rays must resemble each other at the axis (of a hundred columns
+that are tried one shows three by chance), and over how many columns products are summed."""
 _UNLIKE = 0.3
-"""Squared difference of a half turn's ends over what they show, above which they have nothing in common but noise."""
+"""Squared difference of a half turn's ends over what they show, above which they have nothing in
+common but noise."""
 _NOTHING = (
-    "the readings do not tell the axis: where it might be they are no more alike than elsewhere (nothing but noise, or "
+    "the readings do not tell the axis: where it might be they are no more alike than elsewhere "
+    "(nothing but noise, or "
     "an object that is round about the axis)"
 )
 _BLOCKS = 16
 _TIED = 1.7
-"""Both ends compare the same readings, which counts them twice (√2), and smoothing ties neighbouring blocks: measured
-on 120 simulated half turns."""
+"""Both ends compare the same readings, which counts them twice (√2), and smoothing ties
+neighbouring blocks: measured on 120 simulated half turns."""
 
 Floats = NDArray[np.float64]
 
@@ -84,7 +92,9 @@ def at_axis(geometry: Any, column: float) -> Any:
     """The geometry whose axis projects onto ``column``."""
     pitch, _ = _of_columns(geometry)
     offset = ((geometry.columns - 1) / 2 - column) * pitch
-    return replace(geometry, offset=(geometry.offset[0], offset) if isinstance(geometry, ConeBeam) else offset)
+    return replace(
+        geometry, offset=(geometry.offset[0], offset) if isinstance(geometry, ConeBeam) else offset
+    )
 
 
 def _of_columns(geometry: Any) -> tuple[float, float]:
@@ -101,26 +111,37 @@ def rotation_axis(lines: Tensor, geometry: Geometry) -> RotationAxis:
         geometry: parallel, fan or cone beam on a circle.
 
     Raises:
-        ValueError: too few opposite rays (less than half a turn of parallel rays, a fan or cone beam that meets
-            hardly any line twice), or nothing to be seen.
+        ValueError: too few opposite rays (less than half a turn of parallel rays, a fan or cone
+            beam that meets hardly any line twice), or nothing to be seen.
     """
     g: Any = geometry
     shares = _shares(g.angles)
-    shared = 0.0 if shares is None else torch.tensordot(torch.from_numpy(shares).to(lines), lines, 1)
+    shared = (
+        0.0 if shares is None else torch.tensordot(torch.from_numpy(shares).to(lines), lines, 1)
+    )
     found = _by_opposites(lines - shared, g)
     if found is not None:
         # Of a part of a turn what single cells have wrong stays, and is alike in all views.
-        return _stated(found[0], found[1] * (1.0 if shares is not None else 2.0), LEAST, "opposite rays")
+        return _stated(
+            found[0], found[1] * (1.0 if shares is not None else 2.0), LEAST, "opposite rays"
+        )
     if not isinstance(g, ParallelBeam):
-        few = "hardly any line was measured twice, which tells the axis of a fan or cone beam: a full turn does"
+        few = (
+            "hardly any line was measured twice, which tells the axis of a fan or cone beam: a "
+            "full turn does"
+        )
         raise ValueError(few if shares is None else _NOTHING)
-    # What all views of a full turn share may tell it, too: an object that is round about the axis has edges.
+    # What all views of a full turn share may tell it, too: an object that is round about the axis
+    # has edges.
     turn = _turned(g.angles)
     half = np.flatnonzero(turn <= math.pi + 1e-4)
     order = half[np.argsort(turn[half], kind="stable")]
     ends = math.pi - float(turn[order[-1]])
     if order.size < 3 or ends > 2.0 * view_step(g.angles) + 1e-4:
-        raise ValueError(f"the views cover {math.degrees(turn[order[-1]]):.0f}° of the 180° that the search needs")
+        raise ValueError(
+            f"the views cover {math.degrees(turn[order[-1]]):.0f}° of the 180° that the search "
+            "needs"
+        )
     values = lines.detach().cpu().double().numpy()
     column, error = _by_ends(values[order], turn[order])
     whole = _by_centroid(values, g.angles)
@@ -129,7 +150,10 @@ def rotation_axis(lines: Tensor, geometry: Geometry) -> RotationAxis:
     trust = np.maximum([error, whole[1]], 1e-6) ** -2.0
     column = float(trust @ [column, whole[0]] / trust.sum())
     return _stated(
-        column, float(trust.sum() ** -0.5), LEAST_HALF, "the ends of the half turn and the object's centroid"
+        column,
+        float(trust.sum() ** -0.5),
+        LEAST_HALF,
+        "the ends of the half turn and the object's centroid",
     )
 
 
@@ -152,7 +176,8 @@ def _shares(angles: Floats) -> Floats | None:
 
 
 def _turned(angles: Floats) -> Floats:
-    """The angle of every view from the end of the widest gap on, rad, whatever their order and direction."""
+    """The angle of every view from the end of the widest gap on, rad, whatever their order and
+    direction."""
     turn = np.mod(angles, 2 * math.pi)
     ordered = np.sort(turn)
     gaps = np.diff(ordered, append=ordered[0] + 2 * math.pi)
@@ -162,7 +187,8 @@ def _turned(angles: Floats) -> Floats:
 
 
 def _by_opposites(lines: Tensor, geometry: Any) -> tuple[float, float] | None:
-    """Column and its standard error; None where hardly any ray has an opposite, or they are alike by chance."""
+    """Column and its standard error; None where hardly any ray has an opposite, or they are
+    alike by chance."""
     column = _coarse(lines, geometry)
     if column is None:
         return None
@@ -183,8 +209,8 @@ def _by_opposites(lines: Tensor, geometry: Any) -> tuple[float, float] | None:
 def _likeness(lines: Tensor, geometry: Any) -> float:
     """By how many standard deviations opposite rays resemble each other more than noise does.
 
-    Of noise alone the products of the two are as often below 0 as above: the sums over parts of the views, a few
-    columns wide, tell how far their sum may lie from 0.
+    Of noise alone the products of the two are as often below 0 as above: the sums over parts of the
+    views, a few columns wide, tell how far their sum may lie from 0.
     """
     values = lines.detach().to("cpu", torch.float32)
     if isinstance(geometry, ConeBeam):
@@ -203,7 +229,8 @@ def _likeness(lines: Tensor, geometry: Any) -> float:
 
 
 def _coarse(lines: Tensor, geometry: Any) -> float | None:
-    """The column at which opposite rays resemble each other most, to about one; of a cone beam in one row."""
+    """The column at which opposite rays resemble each other most, to about one; of a cone beam
+    in one row."""
     window = DetectorWindow.full(geometry)
     values = lines.detach().to("cpu", torch.float32).reshape(window.shape)
     row = 0
@@ -217,8 +244,12 @@ def _coarse(lines: Tensor, geometry: Any) -> float | None:
     here, window = middle[torch.from_numpy(base)], DetectorWindow.full(geometry)
 
     def likeness(column: float) -> float:
-        opposite, known = OppositeRays(at_axis(geometry, column), window, (0.0, 0.0)).opposite(middle, base)
-        return float((here * opposite)[known].sum()) if int(known.sum()) > columns // 4 else -math.inf
+        opposite, known = OppositeRays(at_axis(geometry, column), window, (0.0, 0.0)).opposite(
+            middle, base
+        )
+        return (
+            float((here * opposite)[known].sum()) if int(known.sum()) > columns // 4 else -math.inf
+        )
 
     best, reach = (columns - 1) / 2, int(_REACH * columns) // width
     steps = [width, 1] if width > 1 else [1]
@@ -234,7 +265,8 @@ def _coarse(lines: Tensor, geometry: Any) -> float | None:
 def _by_ends(lines: Floats, turn: Floats) -> tuple[float, float]:
     """Column and standard error of a half turn ``(views, columns)`` in the order of ``turn``.
 
-    The first views are continued backwards to where the last one stands, mirrored, and the last ones forwards.
+    The first views are continued backwards to where the last one stands, mirrored, and the last
+    ones forwards.
     """
     from scipy.interpolate import CubicSpline
     from scipy.ndimage import gaussian_filter1d
@@ -243,22 +275,27 @@ def _by_ends(lines: Floats, turn: Floats) -> tuple[float, float]:
     at = np.arange(columns)
     step = float(np.median(np.diff(turn)))
     lack = (math.pi - turn[-1]) / step
-    # Between two views what lies off the axis moves by up to step × radius: finer structure says nothing.
+    # Between two views what lies off the axis moves by up to step × radius: finer structure says
+    # nothing.
     width = max(2.0, 0.25 * step * columns) / 2.355
     ends = gaussian_filter1d(lines[[0, 1, -2, -1]], width, axis=-1, mode="nearest")
     onward = [(1 + lack) * ends[0] - lack * ends[1], (1 + lack) * ends[3] - lack * ends[2]]
     mirrors = [CubicSpline(at, ends[3]), CubicSpline(at, ends[0])]
 
     def compared(column: float) -> tuple[Floats, Floats, Floats, Floats]:
-        """Of the readings that have a counterpart: differences, slopes, their power, squares of the readings."""
+        """Of the readings that have a counterpart: differences, slopes, their power, squares of
+        the readings."""
         there = 2 * column - at
         inside = (there >= 0) & (there <= columns - 1)
         parts = []
         for o, m in zip(onward, mirrors, strict=True):
-            # Noise of the two slopes is independent: their product does not know it (instrumental variables).
+            # Noise of the two slopes is independent: their product does not know it (instrumental
+            # variables).
             here, slope = np.gradient(o), m(there, 1)
             parts.append([o - m(there), slope - here, -4.0 * slope * here, o**2 + m(there) ** 2])
-        differences, slopes, power, levels = (np.where(inside, np.stack(v), 0.0) for v in zip(*parts, strict=True))
+        differences, slopes, power, levels = (
+            np.where(inside, np.stack(v), 0.0) for v in zip(*parts, strict=True)
+        )
         return differences, slopes, power, levels
 
     most = 2.0 * float((ends[[0, 3]] ** 2).sum())
@@ -266,7 +303,11 @@ def _by_ends(lines: Floats, turn: Floats) -> tuple[float, float]:
     def unlike(column: float) -> float:
         differences, _, _, levels = compared(column)
         # Air is like air: a part of what the ends show must be compared.
-        return float((differences**2).sum() / levels.sum()) if levels.sum() > _COMPARED * most else math.inf
+        return (
+            float((differences**2).sum() / levels.sum())
+            if levels.sum() > _COMPARED * most
+            else math.inf
+        )
 
     reach = int(_REACH * columns)
     column = min((columns - 1) / 2 + np.arange(-reach, reach + 1), key=unlike)
@@ -281,12 +322,18 @@ def _by_ends(lines: Floats, turn: Floats) -> tuple[float, float]:
         column += min(max(move, -2.0), 2.0)
         if abs(move) < 1e-4:
             break
-    scores = [float(b.sum()) for b in np.array_split(slopes * differences - move * power, _BLOCKS, axis=-1)]
-    return float(column), _TIED * math.sqrt(np.square(scores).sum() * _BLOCKS / (_BLOCKS - 1)) / total
+    scores = [
+        float(b.sum())
+        for b in np.array_split(slopes * differences - move * power, _BLOCKS, axis=-1)
+    ]
+    return float(column), _TIED * math.sqrt(
+        np.square(scores).sum() * _BLOCKS / (_BLOCKS - 1)
+    ) / total
 
 
 def _by_centroid(lines: Floats, angles: Floats) -> tuple[float, float] | None:
-    """Column and standard error of a sinogram ``(views, columns)`` whose object is seen whole, else None."""
+    """Column and standard error of a sinogram ``(views, columns)`` whose object is seen whole,
+    else None."""
     columns = lines.shape[1]
     margin = max(1, columns // 50)
     mass = lines.sum(1)
@@ -307,4 +354,6 @@ def _by_centroid(lines: Floats, angles: Floats) -> tuple[float, float] | None:
     mean = lines.mean(0)
     second = mean[2:] - 2.0 * mean[1:-1] + mean[:-2]
     cells = MEDIAN_TO_SD * float(np.median(np.abs(second))) / math.sqrt(6.0)
-    return float(fit[0]), math.hypot(noise, cells * float(np.linalg.norm(at - fit[0])) / float(mass.mean()))
+    return float(fit[0]), math.hypot(
+        noise, cells * float(np.linalg.norm(at - fit[0])) / float(mass.mean())
+    )

@@ -16,7 +16,8 @@ class ScanTest:
     """What a test of a scan found.
 
     Attributes:
-        sizes: cause → its estimated size, if it were the only one; causes that this scan cannot show are missing.
+        sizes: cause → its estimated size, if it were the only one; causes that this scan cannot
+            show are missing.
         errors: cause → standard error of its size, where there is one.
         findings: what was found, in words; empty: nothing at the stated rate of false alarms.
     """
@@ -43,4 +44,6 @@ def check_lines(lines: Tensor, shape: tuple[int, ...], fits: bool = True) -> Non
     if tuple(lines.shape) != shape or not fits:
         raise ValueError(f"lines must have the shape {shape}, got {tuple(lines.shape)}")
     if not bool(torch.isfinite(lines).all()):
-        raise ValueError("lines hold NaN or Inf: bridge dead readings before (torchpcct.readings.bridge)")
+        raise ValueError(
+            "lines hold NaN or Inf: bridge dead readings before (torchpcct.readings.bridge)"
+        )

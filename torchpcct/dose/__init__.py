@@ -1,8 +1,9 @@
-"""Absorbed dose in axial slices of a scene: primary photons exactly, scattered ones by Monte Carlo, CTDI figures.
+"""Absorbed dose in axial slices of a scene: primary photons exactly, scattered ones by Monte Carlo,
+CTDI figures.
 
-Reading order: ``coefficients`` (energy absorption, and the fluence that reaches the object) → ``primary`` (exact paths
-from the focal spot) → ``scatter`` with ``transport_kernels`` (photon histories) → ``ctdi``, the figures of a standard
-phantom.
+Reading order: ``coefficients`` (energy absorption, and the fluence that reaches the object) →
+``primary`` (exact paths from the focal spot) → ``scatter`` with ``transport_kernels`` (photon
+histories) → ``ctdi``, the figures of a standard phantom.
 """
 
 from torchpcct.dose.coefficients import air_fluence, mass_energy_absorption

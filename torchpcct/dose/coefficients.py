@@ -1,13 +1,15 @@
-"""Mass energy-absorption coefficients of any material, and the fluence that a scanner puts into the object plane.
+"""Mass energy-absorption coefficients of any material, and the fluence that a scanner puts into the
+object plane.
 
-Energy absorption is computed from the parts of the Elam cross-sections: a photoelectric event leaves all its energy, a
-Compton event the mean energy of the Klein–Nishina recoil electron, a coherent event nothing,
+Energy absorption is computed from the parts of the Elam cross-sections: a photoelectric event
+leaves all its energy, a Compton event the mean energy of the Klein–Nishina recoil electron, a
+coherent event nothing,
 
     μ_en = μ_photo + μ_incoh · ⟨T⟩ / E.
 
-Left out: fluorescence that escapes and bremsstrahlung of the electrons. For air, water and soft tissue this agrees with
-the NIST tables (Hubbell and Seltzer 1995) within 2 % from 15 to 150 keV; iodine and metals are overestimated above
-their K edges, where fluorescence carries energy away.
+Left out: fluorescence that escapes and bremsstrahlung of the electrons. For air, water and soft
+tissue this agrees with the NIST tables (Hubbell and Seltzer 1995) within 2 % from 15 to 150 keV;
+iodine and metals are overestimated above their K edges, where fluorescence carries energy away.
 """
 
 from __future__ import annotations
@@ -23,7 +25,13 @@ from torchpcct.scanner.filters import behind_filters
 from torchpcct.scene.materials import Material
 from torchpcct.validate import checked, number
 
-__all__ = ["MGY_PER_KEV_PER_G", "air_fluence", "fan_half_angle", "mass_energy_absorption", "mass_interaction"]
+__all__ = [
+    "MGY_PER_KEV_PER_G",
+    "air_fluence",
+    "fan_half_angle",
+    "mass_energy_absorption",
+    "mass_interaction",
+]
 
 Floats = NDArray[np.float64]
 
@@ -49,29 +57,34 @@ def mass_energy_absorption(material: Material, energies_kev: ArrayLike) -> Float
 
 
 def mass_interaction(material: Material, energies_kev: ArrayLike) -> Floats:
-    """Mass attenuation coefficient μ / ρ in mm²/g: every interaction counts with the photon's whole energy."""
+    """Mass attenuation coefficient μ / ρ in mm²/g: every interaction counts with the photon's
+    whole energy."""
     return np.asarray(
-        material.attenuation(np.atleast_1d(np.asarray(energies_kev, np.float64))) * (1000.0 / material.density_g_cm3)
+        material.attenuation(np.atleast_1d(np.asarray(energies_kev, np.float64)))
+        * (1000.0 / material.density_g_cm3)
     )
 
 
 def fan_half_angle(scanner: Scanner) -> float:
-    """Half-angle of the irradiated fan in rad: the beam is collimated to the outer edges of the detector."""
+    """Half-angle of the irradiated fan in rad: the beam is collimated to the outer edges of the
+    detector."""
     g = scanner.geometry
     edge = abs(g.offset[1]) + g.columns * g.pitch[1] / 2.0
     return edge / g.sdd if g.detector == "curved" else math.atan(edge / g.sdd)
 
 
 @checked
-def air_fluence(scanner: Scanner, fan_angles_rad: ArrayLike, *, group_kev: float = 0.0) -> tuple[Floats, Floats]:
+def air_fluence(
+    scanner: Scanner, fan_angles_rad: ArrayLike, *, group_kev: float = 0.0
+) -> tuple[Floats, Floats]:
     """Photons behind tube, flat filters and bowties, without an object, at 1 m from the focal spot.
 
     Args:
-        scanner: source, filters and bowties count; its detector only sets the edges of the fan, outside which the
-            fluence is 0.
+        scanner: source, filters and bowties count; its detector only sets the edges of the fan,
+            outside which the fluence is 0.
         fan_angles_rad: ``(N,)`` rad.
-        group_kev: join the energy bins into groups of this width, each at the mean energy of its unfiltered photons;
-            0 keeps the scanner's bins.
+        group_kev: join the energy bins into groups of this width, each at the mean energy of its
+            unfiltered photons; 0 keeps the scanner's bins.
 
     Returns:
         ``energies (E,)`` keV and ``photons (N, E)`` per mm² and mAs.

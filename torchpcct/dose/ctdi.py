@@ -2,8 +2,8 @@
 
     CTDI_w = 1/3 · central + 2/3 · mean of the peripheral bores  (IEC 60601-2-44)
 
-Dose is that of the bore's own filling (the plaque study: water) and not the air kerma that a pencil chamber reads; for
-the latter give a ``phantom`` whose bores hold air.
+Dose is that of the bore's own filling (the plaque study: water) and not the air kerma that a pencil
+chamber reads; for the latter give a ``phantom`` whose bores hold air.
 """
 
 from __future__ import annotations
@@ -36,9 +36,11 @@ class CtdiDose:
     """Dose in the bores of a CTDI phantom, mGy per rotation.
 
     Attributes:
-        central, peripheral: by unscattered photons, mean over the central and over the four peripheral bores.
+        central, peripheral: by unscattered photons, mean over the central and over the four
+            peripheral bores.
         central_scattered, peripheral_scattered: by scattered photons, 0 where none were asked for.
-        central_error, peripheral_error: standard errors of the scattered parts (finite number of histories).
+        central_error, peripheral_error: standard errors of the scattered parts (finite number of
+            histories).
     """
 
     central: float
@@ -73,7 +75,9 @@ def disc_samples(center: Any, radius: float, count: int = _SAMPLES) -> Floats:
     """``count`` points that fill a disc evenly (sunflower seeds), ``(count, 2)`` of x, y in mm."""
     k = np.arange(count) + 0.5
     r, phi = radius * np.sqrt(k / count), k * (math.pi * (3.0 - math.sqrt(5.0)))
-    return np.asarray(center, dtype=np.float64) + np.stack([r * np.cos(phi), r * np.sin(phi)], axis=-1)
+    return np.asarray(center, dtype=np.float64) + np.stack(
+        [r * np.cos(phi), r * np.sin(phi)], axis=-1
+    )
 
 
 @checked
@@ -92,16 +96,18 @@ def ctdi_dose(
     Args:
         scanner: its fan must cover the phantom, or the outer bores are partly shaded.
         exposure_s: duration of the rotation in s at the source's current.
-        phantom: scene with the bodies of :func:`torchpcct.scene.phantoms.quality.ctdi`; None: the 32 cm body phantom
-            with water in its bores.
-        axial, quantity: see :func:`torchpcct.dose.primary_dose`; the default is the primary part of CTDI100.
-        histories: photons of the Monte Carlo for the scattered part (:func:`torchpcct.dose.monte_carlo_dose`); 0: no
-            scatter. 4 million give 1.5 % in the central bore.
+        phantom: scene with the bodies of :func:`torchpcct.scene.phantoms.quality.ctdi`; None: the
+            32 cm body phantom with water in its bores.
+        axial, quantity: see :func:`torchpcct.dose.primary_dose`; the default is the primary part of
+            CTDI100.
+        histories: photons of the Monte Carlo for the scattered part
+            (:func:`torchpcct.dose.monte_carlo_dose`); 0: no scatter. 4 million give 1.5 % in the
+            central bore.
         seed: of the Monte Carlo.
 
     Raises:
-        ValueError: bad options, a scene without the phantom's bodies; scatter with ``axial`` or ``quantity`` other
-            than the default.
+        ValueError: bad options, a scene without the phantom's bodies; scatter with ``axial`` or
+            ``quantity`` other than the default.
     """
     scene = ctdi() if phantom is None else phantom
     holes = [scene[name].shape for name in CTDI_HOLES]
@@ -111,7 +117,9 @@ def ctdi_dose(
     if not histories:
         return CtdiDose(central, peripheral)
     if (axial, quantity) != ("contiguous", "absorbed"):
-        raise ValueError("scattered dose exists for axial='contiguous' and quantity='absorbed' only")
+        raise ValueError(
+            "scattered dose exists for axial='contiguous' and quantity='absorbed' only"
+        )
     half = float(scene.bounding_box()[1, :2].max())
     pixels = 2 * math.ceil(half / _PIXEL_MM) + 4
     grid = VolumeGrid((pixels, pixels), _PIXEL_MM)

@@ -1,11 +1,12 @@
-"""Absorbed dose by the photons that come straight from the tube: exact paths through analytic bodies.
+"""Absorbed dose by the photons that come straight from the tube: exact paths through analytic
+bodies.
 
 At a point r of the slice, at distance d from the focal spot of view β and fan angle γ,
 
     D(r) = mAs · ⟨ Σ_E Φ(γ, E) · (1 m / d)² · exp(−Σ_b chord_b Δμ_b(E)) · E · (μ_en / ρ)(E) ⟩_β,
 
-Φ being the fluence in air at 1 m per mAs (:func:`torchpcct.dose.air_fluence`). Chords run from the focal spot to the
-point. Scattered photons are added by :mod:`torchpcct.dose.scatter`.
+Φ being the fluence in air at 1 m per mAs (:func:`torchpcct.dose.air_fluence`). Chords run from the
+focal spot to the point. Scattered photons are added by :mod:`torchpcct.dose.scatter`.
 """
 
 from __future__ import annotations
@@ -47,9 +48,25 @@ _GROUP_KEV = 3.0
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def _dose(
-    begin: int, end: int, xs: Any, ys: Any, z: float, cos_b: Any, sin_b: Any, sod: float, kinds: Any, params: Any,
-    coefficients: Any, basis: Any, half_fan: float, fluence: Any, deposit: Any, medium: Any, falloff: int, out: Any,
-) -> None:  # fmt: skip
+    begin: int,
+    end: int,
+    xs: Any,
+    ys: Any,
+    z: float,
+    cos_b: Any,
+    sin_b: Any,
+    sod: float,
+    kinds: Any,
+    params: Any,
+    coefficients: Any,
+    basis: Any,
+    half_fan: float,
+    fluence: Any,
+    deposit: Any,
+    medium: Any,
+    falloff: int,
+    out: Any,
+) -> None:
     rank, energies = basis.shape
     nodes = fluence.shape[0]
     step = (nodes - 1) / (2.0 * half_fan)
@@ -66,7 +83,9 @@ def _dose(
             dx /= distance
             dy /= distance
             # Columns grow along e_t = (−sin β, cos β); the central ray runs along −e_r.
-            gamma = math.atan2(dy * cos_b[view] - dx * sin_b[view], -(dx * cos_b[view] + dy * sin_b[view]))
+            gamma = math.atan2(
+                dy * cos_b[view] - dx * sin_b[view], -(dx * cos_b[view] + dy * sin_b[view])
+            )
             place = (gamma + half_fan) * step
             if place < 0.0 or place > nodes - 1:
                 continue
@@ -92,25 +111,32 @@ def _dose(
 
 
 def slice_points(where: Any, z_mm: float) -> Floats:
-    """Points ``(..., 3)`` of a slice in mm: the voxel centres of a 2-D grid, or points ``(..., 2)`` of x, y.
+    """Points ``(..., 3)`` of a slice in mm: the voxel centres of a 2-D grid, or points ``(..., 2)``
+    of x, y.
 
     Raises:
         ValueError: a 3-D grid, points of another shape or that are not finite.
     """
     if isinstance(where, VolumeGrid):
         if where.ndim != 2:
-            raise ValueError(f"the map needs a 2-D (y, x) grid, got {where.ndim} axes: use grid.slice")
+            raise ValueError(
+                f"the map needs a 2-D (y, x) grid, got {where.ndim} axes: use grid.slice"
+            )
         where = voxel_centres(where)[..., :2]
     points = np.asarray(where, dtype=np.float64)
     if points.shape[-1:] != (2,) or not np.isfinite(points).all():
-        raise ValueError(f"points must be finite and have the shape (..., 2) of x, y in mm, got {points.shape}")
+        raise ValueError(
+            f"points must be finite and have the shape (..., 2) of x, y in mm, got {points.shape}"
+        )
     return np.concatenate([points, np.full((*points.shape[:-1], 1), float(z_mm))], axis=-1)
 
 
 def check_static(scene: Scene) -> None:
     """Raise ``ValueError`` for a moving scene."""
     if not scene.is_static:
-        raise ValueError("the scene moves: a dose map is that of one place, give scene.with_motion(None)")
+        raise ValueError(
+            "the scene moves: a dose map is that of one place, give scene.with_motion(None)"
+        )
 
 
 @checked
@@ -135,22 +161,26 @@ def primary_dose(
         where: 2-D :class:`~torchpcct.geometry.VolumeGrid`, or points ``(..., 2)`` of x, y in mm.
         exposure_s: duration of the rotation in s at the source's current.
         z_mm: height of the slice.
-        views: source positions that stand for the continuous rotation; those of the scanner do not matter. 360 are
-            exact to 1e-3 inside bodies; behind bone edges give more.
-        medium: material or its name in which dose is scored; None: that of the innermost body at each point, and 0
-            in the surroundings. ``"air"`` gives air kerma (then also outside of the bodies).
-        quantity: ``"absorbed"``: collision kerma, which is the absorbed dose in electron equilibrium (ranges here are
-            below 0.3 mm); ``"interacted"``: every interaction deposits the photon's whole energy, an upper limit.
-        axial: ``"plane"``: in the plane of one thin slice, fluence falls as 1 / d²; ``"contiguous"``: mean over
-            contiguous rotations, each as wide at the isocentre as it is apart from the next, falls as 1 / d. This is
-            the primary part of CTDI.
-        group_kev: width of the energy groups in keV; 3 changes the dose by less than 0.5 %, 0 takes every bin.
+        views: source positions that stand for the continuous rotation; those of the scanner do not
+            matter. 360 are exact to 1e-3 inside bodies; behind bone edges give more.
+        medium: material or its name in which dose is scored; None: that of the innermost body at
+            each point, and 0 in the surroundings. ``"air"`` gives air kerma (then also outside of
+            the bodies).
+        quantity: ``"absorbed"``: collision kerma, which is the absorbed dose in electron
+            equilibrium (ranges here are below 0.3 mm); ``"interacted"``: every interaction deposits
+            the photon's whole energy, an upper limit.
+        axial: ``"plane"``: in the plane of one thin slice, fluence falls as 1 / d²;
+            ``"contiguous"``: mean over contiguous rotations, each as wide at the isocentre as it is
+            apart from the next, falls as 1 / d. This is the primary part of CTDI.
+        group_kev: width of the energy groups in keV; 3 changes the dose by less than 0.5 %, 0 takes
+            every bin.
 
     Returns:
         mGy, float64, of the grid's shape or ``points.shape[:-1]``.
 
     Raises:
-        ValueError: an unknown option or material, a moving scene, ``exposure_s`` ≤ 0, a point outside the orbit.
+        ValueError: an unknown option or material, a moving scene, ``exposure_s`` ≤ 0, a point
+            outside the orbit.
     """
     choice("quantity", quantity, QUANTITIES)
     choice("axial", axial, _AXIAL)
@@ -160,9 +190,13 @@ def primary_dose(
     points = slice_points(where, z_mm)
     g = scanner.geometry
     if points.size and float(np.hypot(points[..., 0], points[..., 1]).max()) >= g.sod:
-        raise ValueError(f"points reach beyond the source orbit of {g.sod} mm: move or shrink the grid")
+        raise ValueError(
+            f"points reach beyond the source orbit of {g.sod} mm: move or shrink the grid"
+        )
     half = fan_half_angle(scanner)
-    energies, fluence = air_fluence(scanner, np.linspace(-half, half, _FAN_NODES), group_kev=group_kev)
+    energies, fluence = air_fluence(
+        scanner, np.linspace(-half, half, _FAN_NODES), group_kev=group_kev
+    )
     if medium is None:
         labels = scene.labels(points)
         media = list(scene.materials)
@@ -178,10 +212,25 @@ def primary_dose(
     flat = points.reshape(-1, 3)
     out = np.zeros(len(flat))
     run(
-        _dose, len(flat), np.ascontiguousarray(flat[:, 0]), np.ascontiguousarray(flat[:, 1]), float(z_mm), np.cos(beta),
-        np.sin(beta), g.sod, kinds, params, coefficients, basis, half, np.ascontiguousarray(fluence), deposit,
-        labels.reshape(-1), _AXIAL.index(axial), out,
-    )  # fmt: skip
+        _dose,
+        len(flat),
+        np.ascontiguousarray(flat[:, 0]),
+        np.ascontiguousarray(flat[:, 1]),
+        float(z_mm),
+        np.cos(beta),
+        np.sin(beta),
+        g.sod,
+        kinds,
+        params,
+        coefficients,
+        basis,
+        half,
+        np.ascontiguousarray(fluence),
+        deposit,
+        labels.reshape(-1),
+        _AXIAL.index(axial),
+        out,
+    )
     return np.asarray((out * (scanner.source.current_ma * exposure_s)).reshape(points.shape[:-1]))
 
 

@@ -1,7 +1,7 @@
 """Photon histories in a slice that continues along z: Woodcock tracking through a map of materials.
 
-Each history is a pure function of (seed, history), each batch has a tally of its own: the result is the same bit for
-bit for any number of threads.
+Each history is a pure function of (seed, history), each batch has a tally of its own: the result is
+the same bit for bit for any number of threads.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ def _find(cumulative: Any, value: float) -> int:
 
 @numba.njit(inline="always", cache=True)
 def _compton(energy: float, state: Any) -> Any:
-    """Scattered energy and cosine after Klein and Nishina (Kahn's rejection, as in Butcher and Messel)."""
+    """Scattered energy and cosine after Klein and Nishina (Kahn's rejection, as in Butcher and
+    Messel)."""
     k = energy / ELECTRON_REST_KEV
     low = 1.0 / (1.0 + 2.0 * k)
     a1, a2 = -math.log(low), 0.5 * (1.0 - low * low)
@@ -45,7 +46,11 @@ def _compton(energy: float, state: Any) -> Any:
         state, u1 = draw(state)
         state, u2 = draw(state)
         state, u3 = draw(state)
-        ratio = math.exp(-a1 * u2) if u1 * (a1 + a2) < a1 else math.sqrt(low * low + (1.0 - low * low) * u2)
+        ratio = (
+            math.exp(-a1 * u2)
+            if u1 * (a1 + a2) < a1
+            else math.sqrt(low * low + (1.0 - low * low) * u2)
+        )
         t = (1.0 - ratio) / (k * ratio)
         sine2 = t * (2.0 - t)
         if u3 <= 1.0 - ratio * sine2 / (1.0 + ratio * ratio):
@@ -54,7 +59,8 @@ def _compton(energy: float, state: Any) -> Any:
 
 @numba.njit(inline="always", cache=True)
 def _rayleigh(energy: float, squares: Any, cumulative: Any, state: Any) -> Any:
-    """Cosine of coherent scatter: x² from the squared form factor up to its kinematic end, then (1 + cos²) / 2."""
+    """Cosine of coherent scatter: x² from the squared form factor up to its kinematic end, then
+    (1 + cos²) / 2."""
     end = (energy / _KEV_ANGSTROM) ** 2
     k = min(_find(squares, end), squares.size - 1)
     part = (end - squares[k - 1]) / (squares[k] - squares[k - 1])
@@ -89,14 +95,39 @@ def _turned(dx: float, dy: float, dz: float, cosine: float, phi: float) -> Any:
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def transport(
-    begin: int, end: int, histories: int, key: Any, labels: Any, x0: float, y0: float, step: float, radius: float,
-    half_z: float, score_z: float, sod: float, half_fan: float, fan_cdf: Any, energy_cdf: Any, energies: Any,
-    table_low: float, table_step: float, attenuation: Any, photo: Any, compton: Any, absorption: Any, largest: Any,
-    squares: Any, form: Any, cutoff: float, tally: Any,
-) -> None:  # fmt: skip
-    """Energy deposited per map pixel by unscattered (tally[:, 0]) and scattered (tally[:, 1]) photons, keV.
+    begin: int,
+    end: int,
+    histories: int,
+    key: Any,
+    labels: Any,
+    x0: float,
+    y0: float,
+    step: float,
+    radius: float,
+    half_z: float,
+    score_z: float,
+    sod: float,
+    half_fan: float,
+    fan_cdf: Any,
+    energy_cdf: Any,
+    energies: Any,
+    table_low: float,
+    table_step: float,
+    attenuation: Any,
+    photo: Any,
+    compton: Any,
+    absorption: Any,
+    largest: Any,
+    squares: Any,
+    form: Any,
+    cutoff: float,
+    tally: Any,
+) -> None:
+    """Energy deposited per map pixel by unscattered (tally[:, 0]) and scattered (tally[:, 1])
+    photons, keV.
 
-    Estimator: every tentative collision of the Woodcock walk scores E μ_en / μ_max of the tissue there.
+    Estimator: every tentative collision of the Woodcock walk scores E μ_en / μ_max of the tissue
+    there.
     """
     ny, nx = labels.shape
     batches = tally.shape[0]
@@ -107,7 +138,8 @@ def transport(
         for history in range(batch * share, (batch + 1) * share):
             state = stream(key, history)
             state, u = draw(state)
-            # Views are stratified: history k of n lies in the k-th part of the turn, shuffled by the golden ratio.
+            # Views are stratified: history k of n lies in the k-th part of the turn, shuffled by
+            # the golden ratio.
             beta = 2.0 * math.pi * ((history * 0.6180339887498949) % 1.0)
             k = _find(fan_cdf, u)
             state, u = draw(state)

@@ -18,7 +18,18 @@ __all__ = ["given_array", "read_array", "read_mat"]
 
 _HDF5_AT = 512
 """Where the HDF5 of a MATLAB file of version 7.3 begins."""
-_OF_NUMBERS = ("double", "single", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")
+_OF_NUMBERS = (
+    "double",
+    "single",
+    "int8",
+    "uint8",
+    "int16",
+    "uint16",
+    "int32",
+    "uint32",
+    "int64",
+    "uint64",
+)
 """MATLAB's classes of numbers."""
 
 
@@ -29,7 +40,8 @@ def read_array(name: str | Sequence[str], folder: Path = Path(), pick: Any = Non
         name: of the file; a pattern, whose files come in the order of the numbers in their names
             (:func:`torchpcct.formats.file_names.matching`); or a list of names, in its order.
         folder: that the name starts from.
-        pick: function of the array's shape that returns the index, one slice an axis, of what to read; None: all.
+        pick: function of the array's shape that returns the index, one slice an axis, of what to
+            read; None: all.
 
     Raises:
         FileNotFoundError: no file. ValueError: damaged, an unknown ending, files of several shapes.
@@ -38,7 +50,9 @@ def read_array(name: str | Sequence[str], folder: Path = Path(), pick: Any = Non
     if len(paths) == 1:
         return _one(paths[0], pick)
     at = (slice(None),) if pick is None else pick((len(paths), *_one(paths[0]).shape))
-    arrays = [_one(path) if pick is None else _one(path, lambda shape: at[1:]) for path in paths[at[0]]]
+    arrays = [
+        _one(path) if pick is None else _one(path, lambda shape: at[1:]) for path in paths[at[0]]
+    ]
     shapes = {a.shape for a in arrays}
     if len(shapes) > 1:
         raise ValueError(f"the files of {name} have several shapes: {sorted(shapes)}")
@@ -46,8 +60,8 @@ def read_array(name: str | Sequence[str], folder: Path = Path(), pick: Any = Non
 
 
 def _one(path: Path, pick: Any = None) -> Any:
-    """The numbers of a file; with ``pick``, a function of the number of axes and the first length, no more of them than
-    the index that it returns."""
+    """The numbers of a file; with ``pick``, a function of the number of axes and the first length,
+    no more of them than the index that it returns."""
     ending = path.suffix.lower()
     if ending == ".npy":
         with reading(path, "a NumPy array"):
@@ -81,10 +95,15 @@ def _tiff(path: Path, pick: Any) -> Any:
             if not ends or max(ends) > size:
                 raise ValueError("it ends before its last image")
             if page.compression == 1 and sum(page.databytecounts) < page.nbytes:
-                raise ValueError(f"it holds {sum(page.databytecounts)} bytes of an image of {page.nbytes}")
+                raise ValueError(
+                    f"it holds {sum(page.databytecounts)} bytes of an image of {page.nbytes}"
+                )
         if len(file.series) > 1:
             shapes = ", ".join(str(series.shape) for series in file.series[:4])
-            raise ValueError(f"it holds images of several kinds, {shapes}: keep those of the scan in their own file")
+            raise ValueError(
+                f"it holds images of several kinds, {shapes}: keep those of the scan in their own "
+                "file"
+            )
         shape, each = file.series[0].shape, file.series[0].dtype.itemsize
         check_size(shape, "the image")
         if pick is None or len(shape) < 3 or len(file.pages) != shape[0]:
@@ -96,7 +115,8 @@ def _tiff(path: Path, pick: Any) -> Any:
 
 
 def given_array(given: Any) -> Any:
-    """A number or an array as it is, or that of the file or pattern that is named (:func:`read_array`)."""
+    """A number or an array as it is, or that of the file or pattern that is named
+    (:func:`read_array`)."""
     return read_array(os.fspath(given)) if isinstance(given, str | os.PathLike) else given
 
 
@@ -109,7 +129,8 @@ def read_mat(path: str | os.PathLike[str], variable: str | None = None) -> Any:
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: damaged, no such variable, several arrays and no name, something else than real numbers.
+        ValueError: damaged, no such variable, several arrays and no name, something else than real
+            numbers.
     """
     with reading(path, "a MATLAB file"):
         with open(path, "rb") as file:
@@ -151,5 +172,10 @@ def _new(path: str | os.PathLike[str], variable: str | None) -> Any:
             if isinstance(data, h5py.Dataset) and data.dtype.kind in "iuf" and data.ndim:
                 held[name] = data.shape[::-1]
         data = file[_picked(held, variable)]
-        check_expansion(data.shape, f"the variable {data.name[1:]}", data.id.get_storage_size, data.dtype.itemsize)
+        check_expansion(
+            data.shape,
+            f"the variable {data.name[1:]}",
+            data.id.get_storage_size,
+            data.dtype.itemsize,
+        )
         return np.asarray(data[()]).T  # MATLAB counts the first axis fastest

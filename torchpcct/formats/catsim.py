@@ -18,9 +18,10 @@ __all__ = ["read_catsim"]
 def read_catsim(results: str | os.PathLike[str], geometry: Geometry, **options: Any) -> Scan:
     """A scan from CatSim's results.
 
-    ``NAME.prep`` holds line integrals; else ``NAME.scan``, ``NAME.air`` and, if there is one, ``NAME.offset`` (dark)
-    hold readings. Columns are taken as they come: CatSim's run along its own direction, so that a mirrored image means
-    a mirrored detector (flip the last axis, or the sign of the angles).
+    ``NAME.prep`` holds line integrals; else ``NAME.scan``, ``NAME.air`` and, if there is one,
+    ``NAME.offset`` (dark) hold readings. Columns are taken as they come: CatSim's run along its own
+    direction, so that a mirrored image means a mirrored detector (flip the last axis, or the sign
+    of the angles).
 
     Args:
         results: path and name without the ending, CatSim's ``resultsName``; or one of the files.
@@ -43,12 +44,16 @@ def read_catsim(results: str | os.PathLike[str], geometry: Geometry, **options: 
         raise FileNotFoundError(f"neither {prep} nor {files['scan']} exists")
     air = _raw(files["air"], geometry.shape[1:])
     dark = _raw(files["offset"], geometry.shape[1:]) if files["offset"].exists() else 0.0
-    return Scan.from_counts(_raw(files["scan"], geometry.shape), geometry, air=air, dark=dark, info=info, **options)
+    return Scan.from_counts(
+        _raw(files["scan"], geometry.shape), geometry, air=air, dark=dark, info=info, **options
+    )
 
 
 def _raw(path: Path, shape: tuple[int, ...]) -> Any:
     with reading(path, "raw float32 readings"):
         expected = 4 * int(np.prod(shape))
         if path.stat().st_size != expected:
-            raise ValueError(f"it has {path.stat().st_size} bytes, the geometry {shape} needs {expected}")
+            raise ValueError(
+                f"it has {path.stat().st_size} bytes, the geometry {shape} needs {expected}"
+            )
         return np.fromfile(path, dtype="<f4").reshape(shape)

@@ -1,4 +1,5 @@
-"""One clear error for files that are truncated, damaged or something else, and one for packages that are missing."""
+"""One clear error for files that are truncated, damaged or something else, and one for packages
+that are missing."""
 
 from __future__ import annotations
 
@@ -41,13 +42,21 @@ def needed(package: str) -> Any:
         raise ImportError(f"this format needs {package}: pip install torchpcct[io]") from error
 
 
-_MOST_TEXT, _LONGEST_TEXT, _MOST_VALUES, _DEEPEST_YAML = 2**24, 2**14, 2**20, 32
+_MOST_TEXT = 2**24
+_LONGEST_TEXT = 2**14
+_MOST_VALUES = 2**20
+_DEEPEST_YAML = 32
 """Of a YAML file: 16 MiB, a million numbers (twelve of each of 87 000 views)."""
 _LONGEST_TABLE = 2**28
 """Bytes of a text file of numbers."""
-_MOST_EXPANSION, _SMALL = 200, 2**30
+_MOST_EXPANSION = 200
+_SMALL = 2**30
 """No scan or volume of more bytes than the second is packed into a file so many times as small."""
-_MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
+_MARKS = (
+    (codecs.BOM_UTF8, "utf-8-sig"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+)
 
 
 @contextmanager
@@ -56,8 +65,8 @@ def reading(path: str | os.PathLike[str], what: str) -> Iterator[None]:
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: a device or a pipe; anything that the libraries raise at damaged contents; errors of this package
-            pass with the path.
+        ValueError: a device or a pipe; anything that the libraries raise at damaged contents;
+            errors of this package pass with the path.
     """
     if not Path(path).exists():
         raise FileNotFoundError(f"no such file: {path}")
@@ -67,10 +76,14 @@ def reading(path: str | os.PathLike[str], what: str) -> Iterator[None]:
     except (ImportError, KeyboardInterrupt):
         raise
     except MemoryError as error:
-        raise ValueError(f"{path} asks for more memory than there is: is its header damaged? ({error})") from error
+        raise ValueError(
+            f"{path} asks for more memory than there is: is its header damaged? ({error})"
+        ) from error
     except Exception as error:
         text = str(error).strip().splitlines()
-        raise ValueError(f"{path} cannot be read as {what}: {text[0] if text else type(error).__name__}") from error
+        raise ValueError(
+            f"{path} cannot be read as {what}: {text[0] if text else type(error).__name__}"
+        ) from error
 
 
 def read_yaml(path: str | os.PathLike[str], what: str) -> Any:
@@ -91,7 +104,9 @@ def _beginning(path: str | os.PathLike[str], most: int) -> bytes:
 
 def _decoded(content: bytes) -> str:
     """Text in UTF-8, or as its byte-order mark says, which editors of Windows set."""
-    return content.decode(next((name for mark, name in _MARKS if content.startswith(mark)), "utf-8"))
+    return content.decode(
+        next((name for mark, name in _MARKS if content.startswith(mark)), "utf-8")
+    )
 
 
 def read_text(path: str | os.PathLike[str], what: str) -> str:
@@ -125,10 +140,12 @@ def read_numbers(path: str | os.PathLike[str], what: str) -> Any:
 
 
 def yaml_values(text: str) -> Any:
-    """Values of a YAML text, bounded: a few hundred bytes of aliases to aliases can stand for any number of values.
+    """Values of a YAML text, bounded: a few hundred bytes of aliases to aliases can stand for any
+    number of values.
 
     Raises:
-        ValueError: no YAML; deeper, or of more values with its aliases written out, than any description is.
+        ValueError: no YAML; deeper, or of more values with its aliases written out, than any
+            description is.
     """
     import yaml
 
@@ -141,7 +158,9 @@ def yaml_values(text: str) -> Any:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = "" if mark is None else f" in line {mark.line + 1}, column {mark.column + 1}"
-        raise ValueError(f"it is no YAML: {getattr(error, 'problem', None) or error}{where}") from error
+        raise ValueError(
+            f"it is no YAML: {getattr(error, 'problem', None) or error}{where}"
+        ) from error
 
 
 def _check_yaml(events: Any) -> None:
@@ -163,16 +182,22 @@ def _check_yaml(events: Any) -> None:
                 anchored[name] = count
         elif isinstance(event, yaml.AliasEvent):
             if event.anchor not in anchored:
-                raise ValueError(f"its alias *{event.anchor} stands for nothing, or for what it is a part of")
+                raise ValueError(
+                    f"its alias *{event.anchor} stands for nothing, or for what it is a part of"
+                )
             counts[-1] += anchored[event.anchor]
         elif isinstance(event, yaml.ScalarEvent):
             if len(event.value) > _LONGEST_TEXT:
-                raise ValueError(f"it holds a text or number of more than {_LONGEST_TEXT} characters")
+                raise ValueError(
+                    f"it holds a text or number of more than {_LONGEST_TEXT} characters"
+                )
             counts[-1] += 1
             if event.anchor is not None:
                 anchored[event.anchor] = 1
         if counts[-1] > _MOST_VALUES:
-            raise ValueError(f"it stands for more than {_MOST_VALUES} values: put arrays into .npy files")
+            raise ValueError(
+                f"it stands for more than {_MOST_VALUES} values: put arrays into .npy files"
+            )
 
 
 def check_size(shape: Any, what: str) -> None:
@@ -187,7 +212,8 @@ def check_size(shape: Any, what: str) -> None:
 
 
 def check_expansion(shape: Any, what: str, packed: int | Callable[[], int], each: int = 4) -> None:
-    """Refuse numbers that are to be read into memory if they do not fit, or if no file so small can hold them.
+    """Refuse numbers that are to be read into memory if they do not fit, or if no file so small can
+    hold them.
 
     Args:
         shape: of the numbers.
@@ -196,7 +222,8 @@ def check_expansion(shape: Any, what: str, packed: int | Callable[[], int], each
         each: bytes of a number in memory.
 
     Raises:
-        ValueError: more than the memory that is free; more than 1 GiB, and 200 times what the file holds.
+        ValueError: more than the memory that is free; more than 1 GiB, and 200 times what the file
+            holds.
     """
     check_size(shape, what)
     size = math.prod(int(n) for n in shape) * each
@@ -204,8 +231,11 @@ def check_expansion(shape: Any, what: str, packed: int | Callable[[], int], each
         held = packed() if callable(packed) else packed
         if size > _MOST_EXPANSION * held:
             raise ValueError(
-                f"{what} of {size / 2**30:.3g} GiB is packed into {held / 2**20:.3g} MiB: no scan or volume is so empty"
+                f"{what} of {size / 2**30:.3g} GiB is packed into {held / 2**20:.3g} MiB: no scan "
+                "or volume is so empty"
             )
     free = free_bytes()
     if size > free:
-        raise ValueError(f"{what} needs {size / 2**30:.3g} GiB, {free / 2**30:.3g} GiB of memory are free")
+        raise ValueError(
+            f"{what} needs {size / 2**30:.3g} GiB, {free / 2**30:.3g} GiB of memory are free"
+        )

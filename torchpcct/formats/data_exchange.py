@@ -1,6 +1,8 @@
-"""Data Exchange HDF5 (De Carlo et al., J. Synchrotron Rad. 21, 1224, 2014): synchrotron and neutron projections.
+"""Data Exchange HDF5 (De Carlo et al., J. Synchrotron Rad. 21, 1224, 2014): synchrotron and neutron
+projections.
 
-What it shares with other parallel-beam files of beamlines (:mod:`~torchpcct.formats.nexus`) is :class:`Frames`.
+What it shares with other parallel-beam files of beamlines (:mod:`~torchpcct.formats.nexus`) is
+:class:`Frames`.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ _PIXEL = (
 _HALF_TURNS = 4
 """Angles without a unit that end within a step of so many half turns, or fewer, are in rad."""
 _LARGEST_RAD = 7.0
-"""Ranges of angles without a unit that may be either, if they are no half turns: beyond it they are degrees."""
+"""Ranges of angles without a unit that may be either, if they are no half turns: beyond it they
+are degrees."""
 
 
 class Frames(NamedTuple):
@@ -65,19 +68,28 @@ class Frames(NamedTuple):
         """The scan, its rotation axis in the detector's middle.
 
         Args:
-            mu_water, options: of :meth:`torchpcct.Scan.from_counts`. Air frames that cannot tell what one photon reads
-                (fewer than four, or averaged before): ``gain="noise"`` unless a number is given.
+            mu_water, options: of :meth:`torchpcct.Scan.from_counts`. Air frames that cannot tell
+                what one photon reads (fewer than four, or averaged before): ``gain="noise"`` unless
+                a number is given.
 
         Raises:
             ValueError: ``mu_water`` where the pixel size is not known; rows that are not there.
         """
         unknown = self.pitch is None
         if unknown and mu_water is not None:
-            raise ValueError(f"HU need the pixel size, but {self.pixel_size}: give pitch= with mu_water=")
+            raise ValueError(
+                f"HU need the pixel size, but {self.pixel_size}: give pitch= with mu_water="
+            )
         pitch = 1.0 if self.pitch is None else number("pitch", self.pitch, positive=True, unit="mm")
         if not self.data.size:
-            raise ValueError(f"slices= must lie within the {self.rows[2] if self.rows else 0} rows of the file")
-        info: dict[str, Any] = {"file": self.path, "format": self.format, "pixel_size": self.pixel_size}
+            raise ValueError(
+                f"slices= must lie within the {self.rows[2] if self.rows else 0} rows of the file"
+            )
+        info: dict[str, Any] = {
+            "file": self.path,
+            "format": self.format,
+            "pixel_size": self.pixel_size,
+        }
         if self.rows is not None:
             info["slices"] = self.rows
         geometry = ParallelBeam(self.angles, self.data.shape[2], pitch)
@@ -108,17 +120,20 @@ def read_data_exchange(
     mu_water: float | None = None,
     **options: Any,
 ) -> Scan:
-    """A parallel-beam scan: ``/exchange/data`` (views, rows, columns) with white and dark frames and ``theta``.
+    """A parallel-beam scan: ``/exchange/data`` (views, rows, columns) with white and dark frames
+    and ``theta``.
 
     Args:
         path: HDF5 file.
-        pitch: cell width in mm; None: the file's pixel size. If it knows none, lengths are in pixels and volumes in
-            pixel^-1.
+        pitch: cell width in mm; None: the file's pixel size. If it knows none, lengths are in
+            pixels and volumes in pixel^-1.
         slices: rows to read; None: all.
-        angles_deg: angles in degrees, as :func:`torchpcct.formats.geometry_yaml.angles_of` takes them; None: the file's
-            ``theta``. That is in degrees or rad as it says; without a unit in rad where it ends at half turns.
-        air, dark: readings without the object, and without beam: a number, an array of one frame or several, or the
-            name of a file of :func:`torchpcct.formats.arrays.read_array`; None: the file's white and dark frames.
+        angles_deg: angles in degrees, as :func:`torchpcct.formats.geometry_yaml.angles_of` takes
+            them; None: the file's ``theta``. That is in degrees or rad as it says; without a unit
+            in rad where it ends at half turns.
+        air, dark: readings without the object, and without beam: a number, an array of one frame or
+            several, or the name of a file of :func:`torchpcct.formats.arrays.read_array`; None: the
+            file's white and dark frames.
         mu_water, options: of :meth:`torchpcct.Scan.from_counts`; see :meth:`Frames.scan`.
 
     Returns:
@@ -127,8 +142,9 @@ def read_data_exchange(
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: no Data Exchange file, damaged, one that keeps data in other files; without angles or air readings
-            where none are given, angles in an unknown unit; ``mu_water`` where the pixel size is not known.
+        ValueError: no Data Exchange file, damaged, one that keeps data in other files; without
+            angles or air readings where none are given, angles in an unknown unit; ``mu_water``
+            where the pixel size is not known.
     """
     import h5py
 
@@ -138,7 +154,9 @@ def read_data_exchange(
             raise ValueError("it has no /exchange/data")
         check_size(data.shape, "/exchange/data")
         if data.ndim != 3:
-            raise ValueError(f"/exchange/data has the shape {data.shape}, expected (views, rows, columns)")
+            raise ValueError(
+                f"/exchange/data has the shape {data.shape}, expected (views, rows, columns)"
+            )
         rows = slice(None) if slices is None else slices
         theta = inside(file, "exchange/theta")
         if angles_deg is not None:
@@ -156,7 +174,8 @@ def read_data_exchange(
             )
         if frames["air"] is None:
             raise ValueError(
-                "it has no white frames, /exchange/data_white: readings cannot be normalised; give air=, the reading "
+                "it has no white frames, /exchange/data_white: readings cannot be normalised; "
+                "give air=, the reading "
                 "without the object"
             )
         if pitch is None:
@@ -185,7 +204,8 @@ def _rows(data: Any, rows: slice) -> Any:
 
 
 def _frames(data: Any, shape: tuple[int, ...], rows: slice) -> Any:
-    """Frames without the object or without beam: several, one, or one number for all cells; None: there are none."""
+    """Frames without the object or without beam: several, one, or one number for all cells;
+    None: there are none."""
     if data is None:
         return None
     check_size(data.shape, data.name)
@@ -195,7 +215,8 @@ def _frames(data: Any, shape: tuple[int, ...], rows: slice) -> Any:
 
 
 def given_frames(given: Any, shape: tuple[int, ...], rows: slice) -> Any:
-    """Frames that a caller gives: a number, frames of the whole detector or of the rows, or the name of their file."""
+    """Frames that a caller gives: a number, frames of the whole detector or of the rows, or the
+    name of their file."""
     values = np.asarray(given_array(given))
     if values.size == 1:
         return float(values.reshape(()))
@@ -218,11 +239,14 @@ def angles_in(data: Any, views: int, what: str, of: Any = slice(None)) -> Any:
     if angles.size != views:
         raise ValueError(f"{data.name} has {angles.size} angles, {what} {views} views")
     angles = angles[of]
-    said = next((unit_text(data.attrs[name]) for name in ("units", "unit") if name in data.attrs), "")
+    said = next(
+        (unit_text(data.attrs[name]) for name in ("units", "unit") if name in data.attrs), ""
+    )
     if said:
         if said not in RAD:
             raise ValueError(
-                f"its angles, {data.name}, are in {said!r}, which is neither deg nor rad: give angles_deg="
+                f"its angles, {data.name}, are in {said!r}, which is neither deg nor rad: give "
+                "angles_deg="
             )
         return angles * RAD[said]
     span = float(np.ptp(angles)) if angles.size else 0.0
@@ -230,19 +254,24 @@ def angles_in(data: Any, views: int, what: str, of: Any = slice(None)) -> Any:
     turns = round((span + 0.5 * step) / math.pi)
     if 1 <= turns <= _HALF_TURNS and -0.01 <= turns * math.pi - span <= 1.5 * step:
         warnings.warn(
-            f"its angles, {data.name}, have no unit and run over {span:.4g}: they are taken for rad, {turns} half "
+            f"its angles, {data.name}, have no unit and run over {span:.4g}: they are taken for "
+            f"rad, {turns} half "
             f"turn{'s' * (turns > 1)}",
             UserWarning,
             stacklevel=2,
         )
         return angles
     if span <= _LARGEST_RAD and angles.size > 1:
-        raise ValueError(f"its angles, {data.name}, have no unit and run over {span:.4g}: deg or rad? Give angles_deg=")
+        raise ValueError(
+            f"its angles, {data.name}, have no unit and run over {span:.4g}: deg or rad? Give "
+            "angles_deg="
+        )
     return np.deg2rad(angles)
 
 
 def length_in(data: Any) -> tuple[float | None, str]:
-    """A length in mm of a data set of one number, None if it has no known unit or is none; and what it says."""
+    """A length in mm of a data set of one number, None if it has no known unit or is none; and
+    what it says."""
     unit = unit_text(data.attrs.get("units", "m"))
     value = float(np.ravel(data[()])[0])
     known = unit in MM and math.isfinite(value) and value > 0

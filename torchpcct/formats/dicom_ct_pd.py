@@ -1,8 +1,10 @@
-"""DICOM-CT-PD: clinical CT projections (Chen et al., Med. Phys. 42, 6900, 2015; the Mayo low-dose CT data).
+"""DICOM-CT-PD: clinical CT projections (Chen et al., Med. Phys. 42, 6900, 2015; the Mayo low-dose
+CT data).
 
-One DICOM file a view. Private tags give the focal spot (angle φ, height z, radius ρ), the detector's shape, spacings
-and central element, and the attenuation of water. The focal spot stands at (−ρ sin φ, ρ cos φ, z); element i of a
-cylindrical detector is seen at the angle φ + (i − i₀) Δ / d, counter-clockwise.
+One DICOM file a view. Private tags give the focal spot (angle φ, height z, radius ρ), the
+detector's shape, spacings and central element, and the attenuation of water. The focal spot stands
+at (−ρ sin φ, ρ cos φ, z); element i of a cylindrical detector is seen at the angle φ + (i − i₀) Δ /
+d, counter-clockwise.
 """
 
 from __future__ import annotations
@@ -56,8 +58,8 @@ class ClinicalProjections(NamedTuple):
     Attributes:
         lines: ``(views, rows, columns)`` line integrals.
         geometry: the circle that the source turns on, at the height of the first view.
-        motion: ``(views, 3)`` z, y, x mm: the table's travel as a displacement of the grid, for ``Projector``; None of
-            a scan at rest.
+        motion: ``(views, 3)`` z, y, x mm: the table's travel as a displacement of the grid, for
+            ``Projector``; None of a scan at rest.
         mu_water: mm⁻¹, or None.
         photons: of an unattenuated reading of every column, or None.
         info: provenance.
@@ -78,7 +80,8 @@ class ClinicalProjections(NamedTuple):
         """
         if self.motion is not None:
             raise ValueError(
-                f"the table travels by {np.ptp(self.motion[:, 0]):.1f} mm: a helical scan has no circular FBP. Use "
+                f"the table travels by {np.ptp(self.motion[:, 0]):.1f} mm: a helical scan has no "
+                "circular FBP. Use "
                 "recon.pwls with Projector(p.geometry, grid, motion=p.motion)"
             )
         photons = None if self.photons is None else np.tile(self.photons, (self.geometry.rows, 1))
@@ -88,11 +91,14 @@ class ClinicalProjections(NamedTuple):
 
 
 def _value(file: Any, name: str, default: Any = None) -> Any:
-    """Numbers of a private tag, whether or not the reader knows its type: float32 if it comes as bytes."""
+    """Numbers of a private tag, whether or not the reader knows its type: float32 if it comes as
+    bytes."""
     tag = _TAGS[name]
     if tag not in file:
         if default is None:
-            raise ValueError(f"it has no tag ({tag >> 16:04X},{tag & 0xFFFF:04X}), the {name.replace('_', ' ')}")
+            raise ValueError(
+                f"it has no tag ({tag >> 16:04X},{tag & 0xFFFF:04X}), the {name.replace('_', ' ')}"
+            )
         return default
     value = file[tag].value
     if isinstance(value, bytes):
@@ -109,10 +115,12 @@ def _value(file: Any, name: str, default: Any = None) -> Any:
 
 
 def holds_projections(path: str | os.PathLike[str]) -> bool:
-    """Whether a DICOM file, or the first one of a folder, is a projection (tag of the detector's rows), not an image.
+    """Whether a DICOM file, or the first one of a folder, is a projection (tag of the detector's
+    rows), not an image.
 
     Raises:
-        FileNotFoundError: no DICOM files. ValueError: a damaged one. ImportError: pydicom is not installed.
+        FileNotFoundError: no DICOM files. ValueError: a damaged one. ImportError: pydicom is not
+            installed.
     """
     first = Path(path) if Path(path).is_file() else dicom_files(path)[0]
     with reading(first, "DICOM"):
@@ -126,14 +134,16 @@ def read_dicom_ct_pd(
 
     Args:
         folder: with one file a view; the instance numbers give their order.
-        ignore_flying_spot: take a deflected focal spot for one at rest: some blur instead of an error.
-        spot: of a flying focal spot, which of its positions, from 0: only the views are read that were taken from it,
-            say every second one, with the source where it was; z counts from its height.
+        ignore_flying_spot: take a deflected focal spot for one at rest: some blur instead of an
+            error.
+        spot: of a flying focal spot, which of its positions, from 0: only the views are read that
+            were taken from it, say every second one, with the source where it was; z counts from
+            its height.
 
     Raises:
         FileNotFoundError: no such folder, or no files in it.
-        ValueError: a damaged or foreign file, missing views, a flat or spherical detector, a focal spot that flies
-            within the views that are read.
+        ValueError: a damaged or foreign file, missing views, a flat or spherical detector, a focal
+            spot that flies within the views that are read.
         ImportError: pydicom is not installed.
     """
     paths = dicom_files(folder)
@@ -149,9 +159,16 @@ def read_dicom_ct_pd(
                 check_expansion((len(paths), first["rows"], first["columns"]), "the scan", size)
             elif detector != first:
                 raise ValueError("its detector differs from that of the first file")
-            angle, height, radius = (float(_value(file, name)[0]) for name in ("angle", "height", "radius"))
-            shift = tuple(float(_value(file, f"shift_{k}", np.zeros(1))[0]) for k in ("angle", "height", "radius"))
-            views.append(_View(int(file.InstanceNumber), angle, height, radius, shift, _pixels(file, first)))
+            angle, height, radius = (
+                float(_value(file, name)[0]) for name in ("angle", "height", "radius")
+            )
+            shift = tuple(
+                float(_value(file, f"shift_{k}", np.zeros(1))[0])
+                for k in ("angle", "height", "radius")
+            )
+            views.append(
+                _View(int(file.InstanceNumber), angle, height, radius, shift, _pixels(file, first))
+            )
             photons = np.asarray(_value(file, "photons", np.zeros(0)), dtype=np.float64)
     views.sort(key=lambda v: v.number)
     _check_complete(folder, np.array([v.number for v in views]))
@@ -159,8 +176,13 @@ def read_dicom_ct_pd(
     views, shift = _from_one_spot(folder, views, g["spot"], ignore_flying_spot, spot)
     radii = np.array([v.radius for v in views])
     if np.ptp(radii) > 1e-3 * radii.mean():
-        raise ValueError(f"{folder}: the focal spot's radius changes from {radii.min():g} to {radii.max():g} mm")
-    angles, heights = np.array([v.angle for v in views]) + math.pi / 2, np.array([v.height for v in views])
+        raise ValueError(
+            f"{folder}: the focal spot's radius changes from {radii.min():g} to {radii.max():g} mm"
+        )
+    angles, heights = (
+        np.array([v.angle for v in views]) + math.pi / 2,
+        np.array([v.height for v in views]),
+    )
     # Element i is seen counter-clockwise, our columns run clockwise about the source.
     geometry = ConeBeam(
         angles,
@@ -179,16 +201,25 @@ def read_dicom_ct_pd(
         motion = np.zeros((len(views), 3))
         motion[:, 0] = heights[0] - heights
     water = float(g["water"]) if g["water"] else None
-    info: dict[str, Any] = {"file": str(folder), "format": "DICOM-CT-PD", "flying_focal_spot": g["spot"]}
+    info: dict[str, Any] = {
+        "file": str(folder),
+        "format": "DICOM-CT-PD",
+        "flying_focal_spot": g["spot"],
+    }
     if any(shift):
-        info["focal_spot_shift"] = dict(zip(("angle_rad", "height_mm", "radius_mm"), shift, strict=True))
+        info["focal_spot_shift"] = dict(
+            zip(("angle_rad", "height_mm", "radius_mm"), shift, strict=True)
+        )
     lines = torch.from_numpy(np.stack([v.lines for v in views]))
     use = photons if photons.size == g["columns"] and (photons > 0).all() else None
-    return ClinicalProjections(lines, geometry, motion, water, None if use is None else use[::-1].copy(), info)
+    return ClinicalProjections(
+        lines, geometry, motion, water, None if use is None else use[::-1].copy(), info
+    )
 
 
 class _View(NamedTuple):
-    """A projection: the instance's number, the focal spot at rest, its deflection, and the line integrals."""
+    """A projection: the instance's number, the focal spot at rest, its deflection, and the line
+    integrals."""
 
     number: int
     angle: float
@@ -199,30 +230,39 @@ class _View(NamedTuple):
 
 
 def _check_complete(folder: Any, numbers: Any) -> None:
-    """Raise ``ValueError`` unless instance numbers count up in equal steps: every view, or every second one, …"""
+    """Raise ``ValueError`` unless instance numbers count up in equal steps: every view, or every
+    second one, …"""
     steps = np.diff(numbers)
     if steps.size and (steps.min() < 1 or np.ptp(steps)):
         usual = max(1, int(np.median(steps)))
         raise ValueError(
-            f"{folder}: the instance numbers have gaps or repeats after {numbers[np.argmax(steps != usual)]}"
+            f"{folder}: the instance numbers have gaps or repeats after "
+            f"{numbers[np.argmax(steps != usual)]}"
         )
 
 
 def _from_one_spot(
     folder: Any, views: list[_View], kind: str, ignore: bool, spot: int | None
 ) -> tuple[list[_View], tuple[float, ...]]:
-    """Views from one position of the focal spot, and how far that is deflected: angle (rad), height, radius (mm)."""
+    """Views from one position of the focal spot, and how far that is deflected: angle (rad),
+    height, radius (mm)."""
     positions: list[tuple[float, ...]] = []
     of = []
     for view in views:
-        near = (k for k, p in enumerate(positions) if (np.abs(np.subtract(p, view.shift)) <= _SAME_SPOT).all())
+        near = (
+            k
+            for k, p in enumerate(positions)
+            if (np.abs(np.subtract(p, view.shift)) <= _SAME_SPOT).all()
+        )
         of.append(next(near, len(positions)))
         if of[-1] == len(positions):
             positions.append(view.shift)
     if spot is not None:
         whole("spot", spot, low=0)
         if spot >= len(positions):
-            raise ValueError(f"spot must be one of the {len(positions)} positions of the focal spot, got {spot}")
+            raise ValueError(
+                f"spot must be one of the {len(positions)} positions of the focal spot, got {spot}"
+            )
         views = [view for view, k in zip(views, of, strict=True) if k == spot]
         _check_complete(folder, np.array([v.number for v in views]))
         return views, positions[spot]
@@ -230,9 +270,14 @@ def _from_one_spot(
         return views, (0.0, 0.0, 0.0)
     named = kind not in ("", "FFSNONE")
     if len(positions) > 1 or (named and not any(positions[0])):
-        where = f"between {len(positions)} positions" if len(positions) > 1 else "and where to is not said"
+        where = (
+            f"between {len(positions)} positions"
+            if len(positions) > 1
+            else "and where to is not said"
+        )
         raise ValueError(
-            f"{folder}: its focal spot flies ({kind}) {where}: pass spot=0 for the views from the first position, "
+            f"{folder}: its focal spot flies ({kind}) {where}: pass spot=0 for the views from the "
+            "first position, "
             "or ignore_flying_spot=True to take it for one at rest"
         )
     return views, positions[0]
@@ -241,7 +286,8 @@ def _from_one_spot(
 def _seen_from(at_rest: ConeBeam, angle: float, height: float, radius: float) -> ConeBeam:
     """The geometry of a source that is deflected against its detector, the same in all views.
 
-    The detector stays an arc about the spot at rest; about the deflected one it is an arc to a twentieth of a cell.
+    The detector stays an arc about the spot at rest; about the deflected one it is an arc to a
+    twentieth of a cell.
 
     Args:
         at_rest: geometry of the spot at rest.
@@ -250,7 +296,8 @@ def _seen_from(at_rest: ConeBeam, angle: float, height: float, radius: float) ->
     g = at_rest
     distance = g.sod + radius
     source = distance * np.array([math.cos(angle), math.sin(angle)])
-    seen = np.asarray(g.fan_angles)  # of the cells, from the spot at rest at (sod, 0), along e_t = (0, 1)
+    # of the cells, from the spot at rest at (sod, 0), along e_t = (0, 1)
+    seen = np.asarray(g.fan_angles)
     cells = np.stack([g.sod - g.sdd * np.cos(seen), g.sdd * np.sin(seen)], -1) - source
     central = -source / distance
     across = np.array([central[1], -central[0]])  # e_t of the deflected spot
@@ -299,5 +346,8 @@ def _pixels(file: Any, g: dict[str, Any]) -> Any:
         stored = stored.T
     elif stored.shape != shape[::-1]:
         raise ValueError(f"its image of {stored.shape} is not the detector's {shape}")
-    slope, intercept = float(getattr(file, "RescaleSlope", 1.0)), float(getattr(file, "RescaleIntercept", 0.0))
+    slope, intercept = (
+        float(getattr(file, "RescaleSlope", 1.0)),
+        float(getattr(file, "RescaleIntercept", 0.0)),
+    )
     return np.ascontiguousarray(stored[:, ::-1] * np.float32(slope) + np.float32(intercept))

@@ -19,35 +19,46 @@ from torchpcct.formats.damage import check_expansion, needed, reading
 from torchpcct.formats.volume_grid import STRAIGHT, grid_from
 from torchpcct.geometry import VolumeGrid
 
-__all__ = ["DICOM_ENDINGS", "check_series", "dicom_files", "open_dicom", "read_dicom", "write_dicom"]
+__all__ = [
+    "DICOM_ENDINGS",
+    "check_series",
+    "dicom_files",
+    "open_dicom",
+    "read_dicom",
+    "write_dicom",
+]
 
 _LOG = logging.getLogger(__name__)
 
 DICOM_ENDINGS = (".dcm", ".ima")
 """Of files that are DICOM whatever is in them."""
-_PREAMBLE, _MARK = 128, b"DICM"
+_PREAMBLE = 128
+_MARK = b"DICM"
 _DIRECTORY = b"1.2.840.10008.1.3.10"
 """Class of a DICOMDIR, which lists files and has no pixels."""
-_DEFLATED, _MOST_INFLATED = "1.2.840.10008.1.2.1.99", 2**27
-"""Transfer syntax whose whole data set is packed, and bytes that it may have: an image of 8192² pixels."""
+_DEFLATED = "1.2.840.10008.1.2.1.99"
+_MOST_INFLATED = 2**27
+"""Transfer syntax whose whole data set is packed, and bytes that it may have: an image of 8192²
+pixels."""
 _CT_CLASS = "1.2.840.10008.5.1.4.1.1.2"
 """CT Image Storage, and the beginning of its enhanced classes."""
 _MADE_BY = "torchpcct"
 _HU_RANGE = (-32768, 32767)
 _ROUNDED = 1e-9
 """Relative, of a decimal string of ten digits."""
-_LOWEST, _AIR = -1024.5, -1000.0
+_LOWEST = -1024.5
+_AIR = -1000.0
 """HU below which no tissue and no air reads, and those of air."""
 
 
-# --- files --------------------------------------------------------------------------------------------------------
+# --- files ----------------------------------------------------------------------------------------
 
 
 def dicom_files(folder: str | os.PathLike[str]) -> list[Path]:
     """DICOM files of a folder, in the order of their names, without what archives put beside them.
 
-    Left out: hidden files, a DICOMDIR, texts, and files of other endings that do not begin as DICOM does. A file that
-    ends like DICOM, or has no ending, is one, damaged or not.
+    Left out: hidden files, a DICOMDIR, texts, and files of other endings that do not begin as DICOM
+    does. A file that ends like DICOM, or has no ending, is one, damaged or not.
 
     Raises:
         FileNotFoundError: none. ValueError: a device or a pipe.
@@ -63,7 +74,9 @@ def dicom_files(folder: str | os.PathLike[str]) -> list[Path]:
             slices = _DIRECTORY + b"\0" not in begin and path.name.upper() != "DICOMDIR"
         else:
             ending = path.suffix.lower()
-            slices = ending in DICOM_ENDINGS or not (re.fullmatch(r"\.[a-z]\w*", ending) or _is_text(begin))
+            slices = ending in DICOM_ENDINGS or not (
+                re.fullmatch(r"\.[a-z]\w*", ending) or _is_text(begin)
+            )
         if slices:
             found.append(path)
         else:
@@ -89,7 +102,8 @@ def open_dicom(path: str | os.PathLike[str], **options: Any) -> Any:
         options: of ``pydicom.dcmread``.
 
     Raises:
-        ValueError: a deflated data set of more than 128 MiB, which no image is; several frames; colours.
+        ValueError: a deflated data set of more than 128 MiB, which no image is; several frames;
+            colours.
         pydicom.errors.InvalidDicomError: no DICOM.
         ImportError: pydicom is not installed.
     """
@@ -107,7 +121,9 @@ def open_dicom(path: str | os.PathLike[str], **options: Any) -> Any:
 
 def _check_inflated(path: str | os.PathLike[str], pydicom: Any) -> None:
     """Inflate bit by bit and throw away: pydicom would take all at once."""
-    length = int(pydicom.filereader.read_file_meta_info(path).get("FileMetaInformationGroupLength", 0))
+    length = int(
+        pydicom.filereader.read_file_meta_info(path).get("FileMetaInformationGroupLength", 0)
+    )
     unpack, total = zlib.decompressobj(-zlib.MAX_WBITS), 0
     with open(path, "rb") as file:
         file.seek(_PREAMBLE + len(_MARK) + 12 + length)
@@ -115,17 +131,22 @@ def _check_inflated(path: str | os.PathLike[str], pydicom: Any) -> None:
         while packed and not unpack.eof:
             total += len(unpack.decompress(packed, 2**20))
             if total > _MOST_INFLATED:
-                raise ValueError(f"its deflated data set is of more than {_MOST_INFLATED // 2**20} MiB: no image is")
+                raise ValueError(
+                    f"its deflated data set is of more than {_MOST_INFLATED // 2**20} MiB: no "
+                    "image is"
+                )
             packed = unpack.unconsumed_tail or file.read(2**16)
 
 
-# --- writing ------------------------------------------------------------------------------------------------------
+# --- writing --------------------------------------------------------------------------------------
 
 
 def check_series(folder: Path, unit: str) -> None:
     """Raise ``ValueError`` unless a CT series can be written to a new or empty folder."""
     if unit != "HU":
-        raise ValueError(f"a DICOM CT series holds HU, this volume is in {unit}: save it as .nii.gz, .mha or .h5")
+        raise ValueError(
+            f"a DICOM CT series holds HU, this volume is in {unit}: save it as .nii.gz, .mha or .h5"
+        )
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: name a new folder, or .nii.gz, .mha or .h5")
     if folder.is_dir() and any(folder.iterdir()):
@@ -133,10 +154,12 @@ def check_series(folder: Path, unit: str) -> None:
 
 
 def write_dicom(folder: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
-    """Write a CT series in HU, one file a slice, into a new or empty folder, which appears whole or not at all.
+    """Write a CT series in HU, one file a slice, into a new or empty folder, which appears whole or
+    not at all.
 
-    int16, intercept 0, slope 1, or where values lie beyond int16 the least slope that holds them. Slices are seen from
-    the feet, anterior up, as radiologists expect them. Each volume is a study of a patient of its own.
+    int16, intercept 0, slope 1, or where values lie beyond int16 the least slope that holds them.
+    Slices are seen from the feet, anterior up, as radiologists expect them. Each volume is a study
+    of a patient of its own.
 
     Raises:
         ValueError: a volume in mm⁻¹, values that are not finite, a folder that holds files.
@@ -147,14 +170,20 @@ def write_dicom(folder: str | os.PathLike[str], data: Any, grid: VolumeGrid, uni
     check_series(Path(folder), unit)
     values = np.asarray(data, dtype=np.float64)
     if not np.isfinite(values).all():
-        raise ValueError("DICOM holds finite HU, the volume has NaN or infinite values: save it as .nii.gz or .h5")
-    slope = float(_ds(max(1.0, values.max() / _HU_RANGE[1], values.min() / _HU_RANGE[0]) * (1 + _ROUNDED)))
+        raise ValueError(
+            "DICOM holds finite HU, the volume has NaN or infinite values: save it as .nii.gz or "
+            ".h5"
+        )
+    slope = float(
+        _ds(max(1.0, values.max() / _HU_RANGE[1], values.min() / _HU_RANGE[0]) * (1 + _ROUNDED))
+    )
     slope = 1.0 if slope < 1 + 2 * _ROUNDED else slope
     stored = np.rint(values / slope).astype("<i2")[:, ::-1, ::-1]
     study, series, frame = (generate_uid() for _ in range(3))
     patient, now = hashlib.sha256(study.encode()).hexdigest()[:12], datetime.datetime.now()
     date, time = now.strftime("%Y%m%d"), now.strftime("%H%M%S")
-    x, y, z = float(grid.axes[2][-1]), float(grid.axes[1][-1]), float(grid.axes[0][0])  # of the first pixel
+    # of the first pixel
+    x, y, z = float(grid.axes[2][-1]), float(grid.axes[1][-1]), float(grid.axes[0][0])
     dz, dy, dx = grid.spacing
     images = []
     for k, image in enumerate(stored):
@@ -162,12 +191,17 @@ def write_dicom(folder: str | os.PathLike[str], data: Any, grid: VolumeGrid, uni
         d.SOPClassUID = CTImageStorage
         d.StudyInstanceUID, d.SeriesInstanceUID, d.FrameOfReferenceUID = study, series, frame
         d.SpecificCharacterSet = "ISO_IR 192"
-        d.Modality, d.Manufacturer, d.SeriesDescription = "CT", _MADE_BY, "simulated or reconstructed by torchpcct"
+        d.Modality, d.Manufacturer, d.SeriesDescription = (
+            "CT",
+            _MADE_BY,
+            "simulated or reconstructed by torchpcct",
+        )
         d.ManufacturerModelName, d.SoftwareVersions = _MADE_BY, VERSION
         d.ImageType = ["DERIVED", "PRIMARY", "AXIAL"]
         d.PatientID, d.PatientName = f"{_MADE_BY}-{patient}", f"{_MADE_BY}^{patient}"
         d.PatientBirthDate = d.PatientSex = ""
-        # The scanner's x, y, z are right, anterior, superior. No part with a left and a right one is known.
+        # The scanner's x, y, z are right, anterior, superior. No part with a left and a right one
+        # is known.
         d.PatientPosition, d.BodyPartExamined = "HFS", "WHOLEBODY"
         d.StudyID, d.AccessionNumber, d.ReferringPhysicianName = "1", "", ""
         d.StudyDate = d.SeriesDate = d.AcquisitionDate = d.ContentDate = date
@@ -192,24 +226,30 @@ def _ds(value: float) -> str:
     return f"{value:.10g}"
 
 
-# --- reading ------------------------------------------------------------------------------------------------------
+# --- reading --------------------------------------------------------------------------------------
 
 
-def read_dicom(path: str | os.PathLike[str], unit: str | None = None) -> tuple[Any, VolumeGrid, str]:
-    """Data ``(z, y, x)`` float32, grid and unit (HU) of a DICOM CT series in a folder, or of one image's file.
+def read_dicom(
+    path: str | os.PathLike[str], unit: str | None = None
+) -> tuple[Any, VolumeGrid, str]:
+    """Data ``(z, y, x)`` float32, grid and unit (HU) of a DICOM CT series in a folder, or of one
+    image's file.
 
-    Slices that lack within a series are found by their places, those at its ends only in series of ours, which know
-    how many there are. One slice is as thick as it says, else 1 mm. Padding about the picture (``PixelPaddingValue``,
-    or one value below −1024 HU in all corners) is read as air, −1000 HU, with a ``UserWarning``.
+    Slices that lack within a series are found by their places, those at its ends only in series of
+    ours, which know how many there are. One slice is as thick as it says, else 1 mm. Padding about
+    the picture (``PixelPaddingValue``, or one value below −1024 HU in all corners) is read as air,
+    −1000 HU, with a ``UserWarning``.
 
     Args:
         path: folder or file.
-        unit: of its numbers, where the images do not say that they are in HU; None: such images are refused.
+        unit: of its numbers, where the images do not say that they are in HU; None: such images are
+            refused.
 
     Raises:
         FileNotFoundError: no such file or folder, or no files in it.
-        ValueError: damaged files, several series, missing or doubled slices, oblique axes; images of another modality
-            than CT, without rescale slope and intercept, or whose ``RescaleType`` is not HU.
+        ValueError: damaged files, several series, missing or doubled slices, oblique axes; images
+            of another modality than CT, without rescale slope and intercept, or whose
+            ``RescaleType`` is not HU.
         ImportError: pydicom is not installed.
     """
     root = Path(path)
@@ -219,11 +259,19 @@ def read_dicom(path: str | os.PathLike[str], unit: str | None = None) -> tuple[A
     for file in paths:
         with reading(file, "a DICOM image"):
             d = open_dicom(file)
-            if root.is_dir() and "Rows" not in d and not str(d.get("SOPClassUID", "")).startswith(_CT_CLASS):
+            if (
+                root.is_dir()
+                and "Rows" not in d
+                and not str(d.get("SOPClassUID", "")).startswith(_CT_CLASS)
+            ):
                 _LOG.info("%s holds no image: left out", file)  # reports, contours and the like
                 continue
             if not slices:
-                check_expansion((len(paths), d.Rows, d.Columns), "the series", sum(p.stat().st_size for p in paths))
+                check_expansion(
+                    (len(paths), d.Rows, d.Columns),
+                    "the series",
+                    sum(p.stat().st_size for p in paths),
+                )
             ours = str(d.get("Manufacturer", "")) == _MADE_BY
             pixels, padded = _hounsfield(d, unit, ours)
             replaced += padded
@@ -244,7 +292,8 @@ def read_dicom(path: str | os.PathLike[str], unit: str | None = None) -> tuple[A
         data, grid = _joined(slices)
     if replaced:
         warnings.warn(
-            f"{path}: {replaced} of {data.size} pixels are padding about the picture, not tissue, and read as air, "
+            f"{path}: {replaced} of {data.size} pixels are padding about the picture, not tissue, "
+            "and read as air, "
             f"{_AIR:.0f} HU",
             UserWarning,
             stacklevel=3,
@@ -281,14 +330,20 @@ _KNOWN = "; if you know that they are, Volume.load(..., unit='HU') reads them"
 
 
 def _check_ct(d: Any) -> None:
-    """Raise ``ValueError`` unless an image says that its numbers are HU; DICOM's CT need not say the type."""
+    """Raise ``ValueError`` unless an image says that its numbers are HU; DICOM's CT need not say
+    the type."""
     modality, kind = str(d.get("Modality") or "").strip(), str(d.get("RescaleType") or "").strip()
     if kind not in ("", "HU"):
         unspecified = " (unspecified)" if kind == "US" else ""
         raise ValueError(f"its RescaleType is {kind}{unspecified}, not HU{_KNOWN}")
-    if modality != "CT" and not (modality == "" and str(d.get("SOPClassUID", "")).startswith(_CT_CLASS)):
+    if modality != "CT" and not (
+        modality == "" and str(d.get("SOPClassUID", "")).startswith(_CT_CLASS)
+    ):
         units = f" in {d.Units}" if d.get("Units") else ""
-        raise ValueError(f"it is of the modality {modality or 'unknown'}{units}, whose numbers are no HU: only CT is")
+        raise ValueError(
+            f"it is of the modality {modality or 'unknown'}{units}, whose numbers are no HU: only "
+            "CT is"
+        )
 
 
 def _padding(d: Any, stored: Any, pixels: Any, ours: bool) -> Any:
@@ -335,7 +390,11 @@ def _joined(slices: list[_Slice]) -> tuple[Any, VolumeGrid]:
     for other in slices[1:]:
         if other.series != series:
             raise ValueError("it holds several series: keep each in a folder of its own")
-        if other.orientation != orientation or other.pixel != pixel or other.image.shape != image.shape:
+        if (
+            other.orientation != orientation
+            or other.pixel != pixel
+            or other.image.shape != image.shape
+        ):
             raise ValueError("its slices differ in orientation, spacing or size")
     row, column = np.array(orientation[:3]), np.array(orientation[3:])
     if abs(abs(row[0]) - 1) > STRAIGHT or abs(abs(column[1]) - 1) > STRAIGHT:

@@ -1,4 +1,5 @@
-"""Files of one scan: which ones a pattern means, and the order that the numbers in their names give."""
+"""Files of one scan: which ones a pattern means, and the order that the numbers in their names
+give."""
 
 from __future__ import annotations
 
@@ -22,8 +23,9 @@ _SHOWN = 4
 def matching(pattern: str, folder: Path) -> list[Path]:
     """Files that a name or pattern means, in the order of the numbers in their names.
 
-    A pattern may be an absolute path, and its ending may differ from the files' in capitals (``.TIF``). Hidden files
-    (``._1.tif`` of a Mac) are left out, as a shell does. A file that is called like the pattern itself is that file.
+    A pattern may be an absolute path, and its ending may differ from the files' in capitals
+    (``.TIF``). Hidden files (``._1.tif`` of a Mac) are left out, as a shell does. A file that is
+    called like the pattern itself is that file.
 
     Args:
         pattern: ``*``, ``?``, ``[...]`` and ``**`` as in a shell.
@@ -47,9 +49,9 @@ def matching(pattern: str, folder: Path) -> list[Path]:
 def in_number_order(paths: Sequence[Path]) -> list[Path]:
     """Files in the order of the numbers in their names: ``p_2`` before ``p_10``.
 
-    Numbers are whole, or have signs and decimals, whichever counts up in equal steps. A ``UserWarning`` says which one
-    was taken where another order is possible and no steps decide: text order where numbers are missing, or decimals
-    against sections (``1.9``, ``1.10``).
+    Numbers are whole, or have signs and decimals, whichever counts up in equal steps. A
+    ``UserWarning`` says which one was taken where another order is possible and no steps decide:
+    text order where numbers are missing, or decimals against sections (``1.9``, ``1.10``).
     """
     text = sorted(paths)
     if len(text) < 2:
@@ -67,9 +69,12 @@ def in_number_order(paths: Sequence[Path]) -> list[Path]:
     others = known[1:] if known else [list(range(len(names))), *(order for order, _ in orders)]
     for other in others:
         if other != taken:
-            asked, instead = (", ".join(text[k].name for k in order[:_SHOWN]) for order in (taken, other))
+            asked, instead = (
+                ", ".join(text[k].name for k in order[:_SHOWN]) for order in (taken, other)
+            )
             warnings.warn(
-                f"the names of {len(text)} files leave their order open: they are read as {asked} (by the numbers), "
+                f"the names of {len(text)} files leave their order open: they are read as {asked} "
+                "(by the numbers), "
                 f"not as {instead}; a list of the names decides",
                 UserWarning,
                 stacklevel=2,
@@ -81,11 +86,14 @@ def in_number_order(paths: Sequence[Path]) -> list[Path]:
 def _parts(name: str, number: re.Pattern[str]) -> tuple[str | float, ...]:
     """Text and numbers of a name in turn, text first and last."""
     texts, values = number.split(name), number.findall(name)
-    return tuple(part for pair in zip(texts, [*map(float, values), 0.0], strict=True) for part in pair)
+    return tuple(
+        part for pair in zip(texts, [*map(float, values), 0.0], strict=True) for part in pair
+    )
 
 
 def _counts_up(keys: Sequence[tuple[str | float, ...]]) -> bool:
-    """Whether names that differ in numbers alone run through all combinations of evenly spaced ones, each once."""
+    """Whether names that differ in numbers alone run through all combinations of evenly spaced
+    ones, each once."""
     if len({len(key) for key in keys}) > 1 or len(set(keys)) < len(keys):
         return False
     combinations = 1

@@ -3,7 +3,7 @@
 A circular scan::
 
     kind: cone                 # parallel, fan, cone
-    angles_deg: {start: 0, step: 0.5, count: 720}      # or a list, or the name of a text file with one angle a line
+    angles_deg: {start: 0, step: 0.5, count: 720}   # or a list, or a text file, one angle a line
     sod: 626                   # not parallel
     sdd: 1098
     columns: 888
@@ -11,12 +11,13 @@ A circular scan::
     pitch: [1.1, 1.0]          # [row, column], or one number
     offset: [0, 0.25]          # optional
     detector: curved           # flat (default) or curved
-    pose:                      # optional, flat detectors: numbers, lists or text files with one number a view
-      {roll_deg: 0.3, tilt_deg: 0, slant_deg: 0, columns: jitter.txt, rows: 0.5, feed: 20, start: -30}
+    pose:       # optional, flat detectors: numbers, lists or text files with one number a view
+      {roll_deg: 0.3, tilt_deg: 0, slant_deg: 0, columns: jitter.txt, rows: 0.5, feed: 20,
+       start: -30}
 
-``pose`` makes a :class:`~torchpcct.vector_geometry.VectorGeometry`: ``columns`` and ``rows`` displace the detector by
-parts of a cell, along its own axes as they are turned; ``feed`` (mm of the source along z in a turn) and ``start`` (its
-first height, mm) make a helix.
+``pose`` makes a :class:`~torchpcct.vector_geometry.VectorGeometry`: ``columns`` and ``rows``
+displace the detector by parts of a cell, along its own axes as they are turned; ``feed`` (mm of the
+source along z in a turn) and ``start`` (its first height, mm) make a helix.
 
 Every view by itself, ASTRA's vectors::
 
@@ -64,7 +65,9 @@ _VECTORS = {
     "rtk": {"file", "columns", "rows", "pitch", "origin"},
 }
 _OPTIONAL = {"offset", "detector", "parallel", "origin"}
-_TURNED, _SHIFTED, _HELIX = ("roll_deg", "tilt_deg", "slant_deg"), ("columns", "rows"), ("feed", "start")
+_TURNED = ("roll_deg", "tilt_deg", "slant_deg")
+_SHIFTED = ("columns", "rows")
+_HELIX = ("feed", "start")
 
 
 def geometry_of(values: Any, folder: Path = Path()) -> Geometry:
@@ -78,7 +81,10 @@ def geometry_of(values: Any, folder: Path = Path()) -> Geometry:
         ValueError, TypeError: missing, unknown or bad values.
     """
     if not isinstance(values, Mapping):
-        raise TypeError(f"geometry must be a mapping with kind, angles_deg, columns, pitch …, got {values!r:.200}")
+        raise TypeError(
+            "geometry must be a mapping with kind, angles_deg, columns, pitch …, got "
+            f"{values!r:.200}"
+        )
     given = dict(values)
     kind = choice("geometry.kind", given.pop("kind", None), (*_KINDS, *_VECTORS))
     own = (_OWN | _VECTORS)[kind]
@@ -86,7 +92,9 @@ def geometry_of(values: Any, folder: Path = Path()) -> Geometry:
     angles = angles_of(given.pop("angles_deg", None), folder) if kind in _KINDS else None
     unknown = sorted(map(str, set(given) - own))
     if unknown:
-        raise ValueError(f"unknown in a {kind} geometry: {', '.join(unknown)}; it takes {', '.join(sorted(own))}")
+        raise ValueError(
+            f"unknown in a {kind} geometry: {', '.join(unknown)}; it takes {', '.join(sorted(own))}"
+        )
     missing = sorted(own - _OPTIONAL - ({"rows"} if kind == "vectors" else set()) - set(given))
     if missing:
         raise ValueError(f"geometry needs {', '.join(missing)}")
@@ -109,13 +117,17 @@ def _posed(circle: Any, pose: Any, folder: Path) -> VectorGeometry:
     """A circular scan whose detector is displaced and turned, or whose table travels."""
     known = (*_TURNED, *_SHIFTED, *_HELIX)
     if not isinstance(pose, Mapping) or not set(pose) <= set(known):
-        raise ValueError(f"geometry.pose must be a mapping of {', '.join(known)}, got {pose!r:.200}")
+        raise ValueError(
+            f"geometry.pose must be a mapping of {', '.join(known)}, got {pose!r:.200}"
+        )
     numbers = {name: _table(f"pose.{name}", value, folder) for name, value in pose.items()}
     helix = {name: numbers[name] for name in _HELIX if name in numbers}
     if "start" in helix and "feed" not in helix:
         raise ValueError("geometry.pose.start is the first height of a helix: give feed, too")
     found = VectorGeometry.of(circle, helical_motion(circle, **helix) if helix else None)
-    found = found.turned(**{name[:-4]: np.deg2rad(numbers[name]) for name in _TURNED if name in numbers})
+    found = found.turned(
+        **{name[:-4]: np.deg2rad(numbers[name]) for name in _TURNED if name in numbers}
+    )
     return found.shifted(**{name: numbers[name] for name in _SHIFTED if name in numbers})
 
 
@@ -123,8 +135,8 @@ def angles_of(value: Any, folder: Path = Path(), views: int | None = None) -> An
     """Angles ``(views,)`` in rad that ``angles_deg`` describes.
 
     Args:
-        value: mapping of start (0, if left out), step and count, a list, or the name of a text or ``.npy`` file with
-            one angle a line; all in degrees.
+        value: mapping of start (0, if left out), step and count, a list, or the name of a text or
+            ``.npy`` file with one angle a line; all in degrees.
         folder: where the file is looked for.
         views: how many there must be; then a mapping needs no count.
 
@@ -132,9 +144,14 @@ def angles_of(value: Any, folder: Path = Path(), views: int | None = None) -> An
         FileNotFoundError: no such file.
         ValueError, TypeError: missing, unknown or bad values, another number of angles.
     """
-    found = _angles(value if views is None or not isinstance(value, Mapping) else {"count": views, **value}, folder)
+    found = _angles(
+        value if views is None or not isinstance(value, Mapping) else {"count": views, **value},
+        folder,
+    )
     if views is not None and found.shape != (views,):
-        raise ValueError(f"angles_deg must be {views} angles, one a view, got the shape {found.shape}")
+        raise ValueError(
+            f"angles_deg must be {views} angles, one a view, got the shape {found.shape}"
+        )
     return found
 
 
@@ -143,7 +160,8 @@ def _angles(value: Any, folder: Path) -> Any:
         unknown = sorted(map(str, set(value) - {"start", "step", "count"}))
         if unknown or not {"step", "count"} <= set(value):
             raise ValueError(
-                f"angles_deg must be {{start, step, count}}, a list or a file's name, got {dict(value)!r:.200}"
+                f"angles_deg must be {{start, step, count}}, a list or a file's name, got "
+                f"{dict(value)!r:.200}"
             )
         count = whole("angles_deg.count", value["count"])
         step = number("angles_deg.step", value["step"], unit="°")
@@ -152,7 +170,9 @@ def _angles(value: Any, folder: Path) -> Any:
     if isinstance(value, str):
         return np.deg2rad(np.atleast_1d(read_numbers(folder / value, "a table of angles")))
     if value is None:
-        raise ValueError("geometry needs angles_deg: {start, step, count}, a list or the name of a text file")
+        raise ValueError(
+            "geometry needs angles_deg: {start, step, count}, a list or the name of a text file"
+        )
     return np.deg2rad(reals("angles_deg", value))
 
 
@@ -161,7 +181,13 @@ def geometry_values(geometry: Any) -> dict[str, Any]:
     if isinstance(geometry, VectorGeometry):
         rows = {} if geometry.rows is None else {"rows": geometry.rows}
         lists = geometry.vectors.tolist()
-        return {"kind": "vectors", "columns": geometry.columns, **rows, "parallel": geometry.parallel, "vectors": lists}
+        return {
+            "kind": "vectors",
+            "columns": geometry.columns,
+            **rows,
+            "parallel": geometry.parallel,
+            "vectors": lists,
+        }
     kind = next(name for name, made in _KINDS.items() if type(geometry) is made)
     degrees = np.rad2deg(geometry.angles)
     step = float(degrees[1] - degrees[0]) if degrees.size > 1 else 0.0

@@ -1,4 +1,5 @@
-"""What an HDF5 file holds itself: its links and data sets may stand for other files, which nobody meant to open."""
+"""What an HDF5 file holds itself: its links and data sets may stand for other files, which
+nobody meant to open."""
 
 from __future__ import annotations
 
@@ -19,8 +20,9 @@ def inside(file: Any, name: str, links: int = 0) -> Any:
     Soft links within the file are followed.
 
     Raises:
-        ValueError: a link to another file stands on the way, a data set keeps its numbers in other files (external
-            storage, a virtual data set), or soft links lead to nothing or in a circle. The message has the names.
+        ValueError: a link to another file stands on the way, a data set keeps its numbers in other
+            files (external storage, a virtual data set), or soft links lead to nothing or in a
+            circle. The message has the names.
     """
     import h5py
 
@@ -37,7 +39,11 @@ def inside(file: Any, name: str, links: int = 0) -> Any:
         if isinstance(link, h5py.SoftLink):
             if links >= _MOST_LINKS:
                 raise ValueError(f"its link {path} leads in a circle")
-            at = inside(file, link.path if link.path.startswith("/") else f"{at.name}/{link.path}", links + 1)
+            at = inside(
+                file,
+                link.path if link.path.startswith("/") else f"{at.name}/{link.path}",
+                links + 1,
+            )
             if at is None:
                 raise ValueError(f"its link {path} leads to {link.path}, which is not there")
         else:
@@ -51,14 +57,17 @@ def _check_storage(data: Any) -> None:
     """Raise ``ValueError`` for a data set whose numbers are kept in other files."""
     if data.external:
         names = ", ".join(dict.fromkeys(str(name) for name, *_ in data.external))
-        raise ValueError(f"its {data.name} keeps its numbers in other files, {names:.200}: {_REMEDY}")
+        raise ValueError(
+            f"its {data.name} keeps its numbers in other files, {names:.200}: {_REMEDY}"
+        )
     if data.is_virtual:
         names = ", ".join(dict.fromkeys(str(source.file_name) for source in data.virtual_sources()))
         raise ValueError(f"its {data.name} is a virtual data set, made of {names:.200}: {_REMEDY}")
 
 
 def require_inside(group: Any, depth: int = 0) -> None:
-    """Raise ``ValueError`` if anything in an HDF5 file of ours, which has no links, stands for another file."""
+    """Raise ``ValueError`` if anything in an HDF5 file of ours, which has no links, stands for
+    another file."""
     import h5py
 
     if depth > _DEEPEST:

@@ -14,7 +14,18 @@ MM = {
     **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 10.0),
     **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1.0),
     **dict.fromkeys(
-        ("um", "µm", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"), 1e-3
+        (
+            "um",
+            "µm",
+            "μm",
+            "micron",
+            "microns",
+            "micrometer",
+            "micrometers",
+            "micrometre",
+            "micrometres",
+        ),
+        1e-3,
     ),
     **dict.fromkeys(("nm", "nanometer", "nanometers", "nanometre", "nanometres"), 1e-6),
 }
@@ -30,4 +41,9 @@ RAD = {
 def unit_text(value: Any) -> str:
     """A unit that stands as text, bytes or an array of one of them in a file, in small letters."""
     first = np.ravel(value)[0]
-    return (first.decode("utf-8", "replace") if isinstance(first, bytes) else str(first)).strip().strip("\0").lower()
+    return (
+        (first.decode("utf-8", "replace") if isinstance(first, bytes) else str(first))
+        .strip()
+        .strip("\0")
+        .lower()
+    )

@@ -1,4 +1,5 @@
-"""Scans in MATLAB files (``.mat``): an array of numbers, of versions 4 to 7 by SciPy, of 7.3 by HDF5."""
+"""Scans in MATLAB files (``.mat``): an array of numbers, of versions 4 to 7 by SciPy, of 7.3 by
+HDF5."""
 
 from __future__ import annotations
 
@@ -27,46 +28,67 @@ def read_mat_scan(
 ) -> Scan:
     """A scan of a MATLAB array: line integrals or, with ``air``, readings.
 
-    The array's axes may stand in the geometry's order (views, [rows,] columns) or turned over, as in a sinogram of
-    (columns, views); its shape tells.
+    The array's axes may stand in the geometry's order (views, [rows,] columns) or turned over, as
+    in a sinogram of (columns, views); its shape tells.
 
     Args:
         path: file.
         geometry: of the scan.
         variable: of :func:`read_mat`.
-        air: readings without the object, one number or an array of the geometry's order; None: the array holds line
-            integrals, −ln of the transmission.
+        air: readings without the object, one number or an array of the geometry's order; None: the
+            array holds line integrals, −ln of the transmission.
         dark: readings without beam, as ``air``.
-        options: of :meth:`torchpcct.Scan.from_line_integrals` or :meth:`~torchpcct.Scan.from_counts`.
+        options: of :meth:`torchpcct.Scan.from_line_integrals` or
+            :meth:`~torchpcct.Scan.from_counts`.
 
     Raises:
-        ValueError: damaged, several arrays, a shape that is not the geometry's, or that is it both ways.
+        ValueError: damaged, several arrays, a shape that is not the geometry's, or that is it both
+            ways.
     """
     values, air, dark = read_mat(path, variable), given_array(air), given_array(dark)
     info = {"file": str(path), "format": "MATLAB"}
     if air is None:
         if dark is not None:
             raise ValueError("dark= belongs to readings: give air=, too")
-        return Scan.from_line_integrals(_in_order(values, geometry, path), geometry, info=info, **options)
+        return Scan.from_line_integrals(
+            _in_order(values, geometry, path), geometry, info=info, **options
+        )
     held = unwrapped(
-        {"readings": _in_order(values, geometry, path), "air": air, "dark": 0.0 if dark is None else dark}, str(path)
+        {
+            "readings": _in_order(values, geometry, path),
+            "air": air,
+            "dark": 0.0 if dark is None else dark,
+        },
+        str(path),
     )
     readings = held.pop("readings")
     return Scan.from_counts(readings, geometry, info=info, **held, **options)
 
 
 def _in_order(values: Any, geometry: Geometry, path: str | os.PathLike[str]) -> Any:
-    """Readings with the geometry's axes last: as they are, turned over, or with the last axis first."""
+    """Readings with the geometry's axes last: as they are, turned over, or with the last axis
+    first."""
     shape = geometry.shape
-    orders = [("as it stands", values), ("turned over", values.T), ("the last axis first", np.moveaxis(values, -1, 0))]
+    orders = [
+        ("as it stands", values),
+        ("turned over", values.T),
+        ("the last axis first", np.moveaxis(values, -1, 0)),
+    ]
     orders = orders[: values.ndim]  # of two axes the last ways are one
-    fits = [(how, a) for how, a in orders if a.shape[-len(shape) :] == shape and a.ndim <= len(shape) + 1]
+    fits = [
+        (how, a)
+        for how, a in orders
+        if a.shape[-len(shape) :] == shape and a.ndim <= len(shape) + 1
+    ]
     if not fits:
-        raise ValueError(f"{path}: its array of {values.shape} is not the geometry's {shape}, turned over or not")
+        raise ValueError(
+            f"{path}: its array of {values.shape} is not the geometry's {shape}, turned over or not"
+        )
     if len(fits) > 1:
         ways = ", or ".join(how for how, _ in fits)
         warnings.warn(
-            f"{path}: an array of {values.shape} fits the geometry {shape} in several ways ({ways}): it is taken "
+            f"{path}: an array of {values.shape} fits the geometry {shape} in several ways "
+            f"({ways}): it is taken "
             f"{fits[0][0]}; give its transpose, if that is wrong",
             UserWarning,
             stacklevel=3,

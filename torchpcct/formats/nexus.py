@@ -1,6 +1,8 @@
-"""NeXus files of tomography, NXtomo (https://manual.nexusformat.org/classes/applications/NXtomo.html).
+"""NeXus files of tomography, NXtomo
+(https://manual.nexusformat.org/classes/applications/NXtomo.html).
 
-One data set of all frames, of which ``image_key`` says what each is: 0 projection, 1 flat, 2 dark field, 3 invalid.
+One data set of all frames, of which ``image_key`` says what each is: 0 projection, 1 flat, 2 dark
+field, 3 invalid.
 """
 
 from __future__ import annotations
@@ -21,7 +23,9 @@ from torchpcct.validate import choice
 
 __all__ = ["holds_nexus", "read_nexus"]
 
-_PROJECTION, _FLAT, _DARK = 0, 1, 2
+_PROJECTION = 0
+_FLAT = 1
+_DARK = 2
 _DEEPEST = 5
 """Groups between the file and its detector."""
 _SAME_TIME = 1e-3
@@ -54,14 +58,17 @@ def holds_nexus(file: Any) -> bool:
 
 
 def _is_detector(group: Any) -> bool:
-    """Whether a group is where the frames are at home, and no view of them for plotting (NXdata)."""
+    """Whether a group is where the frames are at home, and no view of them for plotting
+    (NXdata)."""
     return unit_text(group.attrs.get("NX_class", "")) == "nxdetector"
 
 
 def _own_group(file: Any, name: str) -> bool:
     import h5py
 
-    return isinstance(file.get(name, getlink=True), h5py.HardLink) and isinstance(file[name], h5py.Group)
+    return isinstance(file.get(name, getlink=True), h5py.HardLink) and isinstance(
+        file[name], h5py.Group
+    )
 
 
 def read_nexus(
@@ -76,17 +83,19 @@ def read_nexus(
     mu_water: float | None = None,
     **options: Any,
 ) -> Scan:
-    """A parallel-beam scan of an NXtomo file, the mean of its flat and of its dark frames as air and dark.
+    """A parallel-beam scan of an NXtomo file, the mean of its flat and of its dark frames as air
+    and dark.
 
     Flats that were taken with another ``count_time`` than the projections count by the ratio.
 
     Args:
         path: HDF5 file.
         entry: name of the NXentry, of a file that holds several scans.
-        pitch: cell width in mm; None: the detector's ``x_pixel_size``. If the file knows none, lengths are in pixels.
+        pitch: cell width in mm; None: the detector's ``x_pixel_size``. If the file knows none,
+            lengths are in pixels.
         slices: rows to read; None: all.
-        angles_deg, air, dark: of :func:`torchpcct.formats.data_exchange.read_data_exchange`, in the place of the
-            file's; ``angles_deg`` of the projections alone.
+        angles_deg, air, dark: of :func:`torchpcct.formats.data_exchange.read_data_exchange`, in the
+            place of the file's; ``angles_deg`` of the projections alone.
         mu_water, options: of :meth:`torchpcct.Scan.from_counts`.
 
     Returns:
@@ -94,33 +103,44 @@ def read_nexus(
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: no NXtomo, damaged, several scans and no ``entry``, one that keeps data in other files; no flats,
-            angles in an unknown unit.
+        ValueError: no NXtomo, damaged, several scans and no ``entry``, one that keeps data in other
+            files; no flats, angles in an unknown unit.
     """
     import h5py
 
     with reading(path, "a NeXus tomography"), h5py.File(path, "r") as file:
         detector = _detector(file, entry)
-        data, key = inside(file, f"{detector}/data"), np.ravel(inside(file, f"{detector}/image_key")[()]).astype(int)
+        data, key = (
+            inside(file, f"{detector}/data"),
+            np.ravel(inside(file, f"{detector}/image_key")[()]).astype(int),
+        )
         check_size(data.shape, data.name)
         if data.ndim != 3 or key.size != data.shape[0]:
             raise ValueError(
-                f"{data.name} has the shape {data.shape}, expected (frames, rows, columns) of {key.size} keys"
+                f"{data.name} has the shape {data.shape}, expected (frames, rows, columns) of "
+                f"{key.size} keys"
             )
         rows = slice(None) if slices is None else slices
         views = np.flatnonzero(key == _PROJECTION)
         if not views.size:
             raise ValueError(f"{detector}/image_key names no projections (0)")
         held = {
-            "air": _taken(data, key == _FLAT, rows) if air is None else given_frames(air, data.shape, rows),
-            "dark": _taken(data, key == _DARK, rows) if dark is None else given_frames(dark, data.shape, rows),
+            "air": _taken(data, key == _FLAT, rows)
+            if air is None
+            else given_frames(air, data.shape, rows),
+            "dark": _taken(data, key == _DARK, rows)
+            if dark is None
+            else given_frames(dark, data.shape, rows),
         }
         if held["air"] is None:
             raise ValueError(
-                f"{detector}/image_key names no flat fields (1): give air=, the reading without the object"
+                f"{detector}/image_key names no flat fields (1): give air=, the reading without "
+                "the object"
             )
         black = 0.0 if held["dark"] is None else held["dark"]
-        white = held["air"] if air is not None else _as_long(file, detector, key, held["air"], black)
+        white = (
+            held["air"] if air is not None else _as_long(file, detector, key, held["air"], black)
+        )
         size = inside(file, f"{detector}/x_pixel_size")
         said = "the file does not know its pixel size"
         if pitch is not None:
@@ -168,7 +188,9 @@ def _taken(data: Any, which: Any, rows: slice) -> Any:
     if not at.size:
         return None
     height = max(1, len(range(*rows.indices(data.shape[1]))))
-    check_expansion((at.size, height, data.shape[2]), data.name, data.id.get_storage_size, data.dtype.itemsize)
+    check_expansion(
+        (at.size, height, data.shape[2]), data.name, data.id.get_storage_size, data.dtype.itemsize
+    )
     runs = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
     return np.concatenate([data[run[0] : run[-1] + 1, rows] for run in runs])
 
@@ -193,7 +215,9 @@ def _angles(file: Any, detector: str, key: Any, given: Any) -> Any:
         return angles_of(given, views=views)
     above = detector.split("/")[1:-1]
     entries = ["/" + "/".join(above[:n]) for n in range(len(above), 0, -1)]
-    for name in (f"{entry}/{part}/rotation_angle" for entry in entries for part in ("sample", "data")):
+    for name in (
+        f"{entry}/{part}/rotation_angle" for entry in entries for part in ("sample", "data")
+    ):
         data = inside(file, name)
         if data is not None and data.size == key.size:
             return angles_in(data, key.size, f"{detector}/data", key == _PROJECTION)

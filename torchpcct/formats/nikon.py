@@ -1,8 +1,8 @@
 """Cone-beam scans of Nikon / X-Tek machines: ``NAME.xtekct`` beside ``NAME_0001.tif``, …
 
-The files count views as the object turns, columns from the right and rows from the top, as CIL's ``NikonDataReader``
-has found (https://github.com/TomographicImaging/CIL): here the source turns the other way, columns and rows are turned
-over.
+The files count views as the object turns, columns from the right and rows from the top, as CIL's
+``NikonDataReader`` has found (https://github.com/TomographicImaging/CIL): here the source turns the
+other way, columns and rows are turned over.
 """
 
 from __future__ import annotations
@@ -59,11 +59,13 @@ def read_xtekct(
         path: ``.xtekct`` file.
         slices: detector rows to read, counted upwards; None: all.
         air: reading without the object; None: the file's ``WhiteLevel``.
-        dark, mu_water, options: of :meth:`torchpcct.Scan.from_counts`; ``gain`` by default from the noise.
+        dark, mu_water, options: of :meth:`torchpcct.Scan.from_counts`; ``gain`` by default from the
+            noise.
 
     Raises:
         FileNotFoundError: no such file, or no images.
-        ValueError: a value that is missing or none, another number of images than ``Projections``, damaged images.
+        ValueError: a value that is missing or none, another number of images than ``Projections``,
+            damaged images.
     """
     text = read_text(path, "a Nikon scan")
     with reading(path, "a Nikon scan"):
@@ -75,8 +77,12 @@ def read_xtekct(
         missing = [name for name in _NEEDED if not about.get(name, "").strip()]
         if missing:
             raise ValueError(f"it has no {', '.join(missing)}")
-        values = {name: number(name, about[name], positive=name != "AngularStep") for name in _NEEDED}
-        views, columns, rows = (int(values[k]) for k in ("Projections", "DetectorPixelsX", "DetectorPixelsY"))
+        values = {
+            name: number(name, about[name], positive=name != "AngularStep") for name in _NEEDED
+        }
+        views, columns, rows = (
+            int(values[k]) for k in ("Projections", "DetectorPixelsX", "DetectorPixelsY")
+        )
         magnification = values["SrcToDetector"] / values["SrcToObject"]
         top, bottom = (_optional(about, f"CentreOfRotation{end}") for end in ("Top", "Bottom"))
         moved = about.get("ObjectOffsetX", "").strip()
@@ -87,12 +93,15 @@ def read_xtekct(
         for name, degrees in tilts.items():
             if abs(degrees) > _STRAIGHT_DEG:
                 warnings.warn(
-                    f"{path}: the rotation axis is inclined ({name} {degrees:.3g}°), which is left out: give a "
+                    f"{path}: the rotation axis is inclined ({name} {degrees:.3g}°), which is "
+                    "left out: give a "
                     "VectorGeometry for it",
                     UserWarning,
                     stacklevel=2,
                 )
-        angles = np.deg2rad(90.0 + _optional(about, "InitialAngle") + values["AngularStep"] * np.arange(views))
+        angles = np.deg2rad(
+            90.0 + _optional(about, "InitialAngle") + values["AngularStep"] * np.arange(views)
+        )
         geometry = ConeBeam(
             angles,
             values["SrcToObject"],
@@ -118,8 +127,12 @@ def read_xtekct(
         raise ValueError(f"{path}: its images have the shape {readings.shape}, it says {expected}")
     options.setdefault("gain", "noise")
     white = values["WhiteLevel"] if air is None else given_array(air)
-    held = unwrapped({"readings": readings[:, ::-1, ::-1], "air": white, "dark": given_array(dark)}, str(path))
-    return Scan.from_counts(held.pop("readings"), geometry, mu_water=mu_water, info=info, **held, **options)
+    held = unwrapped(
+        {"readings": readings[:, ::-1, ::-1], "air": white, "dark": given_array(dark)}, str(path)
+    )
+    return Scan.from_counts(
+        held.pop("readings"), geometry, mu_water=mu_water, info=info, **held, **options
+    )
 
 
 def _optional(about: Any, name: str) -> float:
@@ -133,12 +146,17 @@ def _images(path: Path, about: Any, views: int) -> list[Path]:
         about.get("Name", "").strip() or path.stem,
         about.get("InputFolderName", "").strip().replace("\\", "/"),
     )
-    wanted = re.compile(re.escape(name + about.get("InputSeparator", "_").strip()) + r"\d+\.tiff?", re.IGNORECASE)
-    places = [path.parent / folder, path.parent / Path(folder).name, path.parent]  # moved from where it was written
+    wanted = re.compile(
+        re.escape(name + about.get("InputSeparator", "_").strip()) + r"\d+\.tiff?", re.IGNORECASE
+    )
+    # moved from where it was written
+    places = [path.parent / folder, path.parent / Path(folder).name, path.parent]
     found: list[Path] = []
     for place in dict.fromkeys(places):
         if place.is_dir():
-            found = in_number_order([each for each in place.iterdir() if wanted.fullmatch(each.name)])
+            found = in_number_order(
+                [each for each in place.iterdir() if wanted.fullmatch(each.name)]
+            )
         if found:
             break
     if len(found) != views:

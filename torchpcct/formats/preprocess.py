@@ -20,17 +20,25 @@ __all__ = ["centred", "cleaned", "find_axis", "without_outliers", "without_strip
 
 @checked
 def find_axis(scan: Scan) -> RotationAxis:
-    """The column of the rotation axis with its error: of a full turn of any beam, or half a turn of parallel rays.
+    """The column of the rotation axis with its error: of a full turn of any beam, or half a turn of
+    parallel rays.
 
-    Of several slices the one with the most to be seen is looked at (:mod:`torchpcct.checks.rotation_axis`).
+    Of several slices the one with the most to be seen is looked at
+    (:mod:`torchpcct.checks.rotation_axis`).
 
     Raises:
-        ValueError: a part of the detector, a geometry view by view, energy bins; too few opposite rays, or nothing to
-            be seen.
+        ValueError: a part of the detector, a geometry view by view, energy bins; too few opposite
+            rays, or nothing to be seen.
     """
     g = scan.geometry
-    if not isinstance(g, ParallelBeam | FanBeam | ConeBeam) or scan.window is not None or scan.counts.ndim > 3:
-        raise ValueError("the axis is found from all columns of a parallel, fan or cone beam on a circle")
+    if (
+        not isinstance(g, ParallelBeam | FanBeam | ConeBeam)
+        or scan.window is not None
+        or scan.counts.ndim > 3
+    ):
+        raise ValueError(
+            "the axis is found from all columns of a parallel, fan or cone beam on a circle"
+        )
     lines = scan.line_integrals()
     if lines.ndim > len(g.shape):
         lines = lines[int(lines.flatten(1).var(1).argmax())]
@@ -39,12 +47,15 @@ def find_axis(scan: Scan) -> RotationAxis:
 
 @checked
 def centred(scan: Scan, axis: float | RotationAxis | None = None) -> Scan:
-    """The same scan with its rotation axis at a column; None: :func:`find_axis`, noted in ``info``."""
+    """The same scan with its rotation axis at a column; None: :func:`find_axis`, noted in
+    ``info``."""
     found = find_axis(scan) if axis is None else axis
     if not isinstance(found, RotationAxis):
         return replace(scan, geometry=at_axis(scan.geometry, found))
     found_axis = {"column": found.column, "error": found.error, "found_from": found.how}
-    return replace(scan, geometry=at_axis(scan.geometry, found.column), info={**scan.info, "axis": found_axis})
+    return replace(
+        scan, geometry=at_axis(scan.geometry, found.column), info={**scan.info, "axis": found_axis}
+    )
 
 
 @checked
@@ -52,15 +63,20 @@ def cleaned(scan: Scan) -> Scan:
     """The same parallel or fan-beam scan without outliers and stripes (:func:`without_outliers`,
     :func:`without_stripes`).
 
-    Readings that no object can cause (:func:`torchpcct.checks.defects.repair_defects`) are bridged before. The others
-    are changed by the factor that their logarithms ask for, so that the scan keeps its weights.
+    Readings that no object can cause (:func:`torchpcct.checks.defects.repair_defects`) are bridged
+    before. The others are changed by the factor that their logarithms ask for, so that the scan
+    keeps its weights.
 
     Raises:
         ValueError: a cone beam, or a scan of a part of the detector.
     """
     if scan.geometry.has_rows:
-        raise ValueError("stripes are taken from sinograms (views, columns): of a parallel or fan beam, without window")
-    scan = repair_defects(scan)[0]  # cells without signal for part of the turn are no stripes: nothing is left of them
+        raise ValueError(
+            "stripes are taken from sinograms (views, columns): of a parallel or fan beam, "
+            "without window"
+        )
+    # cells without signal for part of the turn are no stripes: nothing is left of them
+    scan = repair_defects(scan)[0]
     lines = scan._logarithm()  # before the water correction, which belongs to the true readings
     if scan.dead is not None:
         lines = bridge(lines, scan.dead, rows=False)
@@ -68,24 +84,27 @@ def cleaned(scan: Scan) -> Scan:
     return replace(scan, counts=scan.counts * torch.exp(lines - corrected))
 
 
-_LASTING, _LEAST_VIEWS, _BLOCKS = (0.4, 0.2, 0.1), 30, 360
-"""Parts of the views over which stripes are looked for, the fewest views of such a part, and what many views are
-averaged to."""
+_LASTING = (0.4, 0.2, 0.1)
+_LEAST_VIEWS = 30
+_BLOCKS = 360
+"""Parts of the views over which stripes are looked for, the fewest views of such a part, and what
+many views are averaged to."""
 
 
 @checked
 def without_stripes(lines: Tensor, *, snr: float = 3.0) -> Tensor:
-    """Line integrals ``(..., views, columns)`` without the stripes of cells whose gain is off: rings in the image.
+    """Line integrals ``(..., views, columns)`` without the stripes of cells whose gain is off:
+    rings in the image.
 
-    Cells that are wrong for part of the views stand out of the median of the nine columns about them, in the median
-    over :data:`_LASTING` of the views. Then the mean over the views runs smoothly along the columns, or steps: a cell
-    that stands out of the median of its five neighbours is wrong by a constant, which is taken off (Rivers 1998; Boin
-    and Haibel, Opt. Express 14, 12071, 2006).
-    Details of the object stay in one column for a while, too, near the axis and where their paths turn back; there
-    neighbours stand out as well, and the columns stay as they are. Partial stripes beside steep edges stay, therefore,
-    and those of more than three columns.
-    (Vo's filters, Opt. Express 26, 28396, 2018, in algotom's remove_all_stripe, change all columns: on a neutron scan
-    without stripes they triple the error.)
+    Cells that are wrong for part of the views stand out of the median of the nine columns about
+    them, in the median over :data:`_LASTING` of the views. Then the mean over the views runs
+    smoothly along the columns, or steps: a cell that stands out of the median of its five
+    neighbours is wrong by a constant, which is taken off (Rivers 1998; Boin and Haibel, Opt.
+    Express 14, 12071, 2006). Details of the object stay in one column for a while, too, near the
+    axis and where their paths turn back; there neighbours stand out as well, and the columns stay
+    as they are. Partial stripes beside steep edges stay, therefore, and those of more than three
+    columns. (Vo's filters, Opt. Express 26, 28396, 2018, in algotom's remove_all_stripe, change all
+    columns: on a neutron scan without stripes they triple the error.)
 
     Args:
         snr: standard deviations, of all columns, that a stripe must stand out to be taken for one.
@@ -123,8 +142,9 @@ def without_stripes(lines: Tensor, *, snr: float = 3.0) -> Tensor:
 def without_outliers(lines: Tensor, *, threshold: float = 0.08) -> Tensor:
     """Line integrals ``(..., views, columns)`` without single outliers (cosmic rays, "zingers").
 
-    A reading that differs from the median of its 3 × 3 neighbourhood in views and columns by more than ``threshold``
-    and by more than eight standard deviations of such differences (from their median) takes that median.
+    A reading that differs from the median of its 3 × 3 neighbourhood in views and columns by more
+    than ``threshold`` and by more than eight standard deviations of such differences (from their
+    median) takes that median.
     """
     from scipy.ndimage import median_filter
 

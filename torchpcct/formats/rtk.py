@@ -1,8 +1,8 @@
 """Per-view geometry of RTK's ``ThreeDCircularProjectionGeometry`` XML, as a
 :class:`~torchpcct.vector_geometry.VectorGeometry`.
 
-Each ``<Projection>`` holds a 3 × 4 ``<Matrix>`` that maps points of the world in mm to homogeneous detector coordinates
-in mm. RTK turns about its y axis; here z is the axis, x RTK's z and y RTK's x.
+Each ``<Projection>`` holds a 3 × 4 ``<Matrix>`` that maps points of the world in mm to homogeneous
+detector coordinates in mm. RTK turns about its y axis; here z is the axis, x RTK's z and y RTK's x.
 """
 
 from __future__ import annotations
@@ -23,21 +23,29 @@ _OURS = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 """RTK's (x, y, z) to ours."""
 
 
-def read_rtk(path: str | os.PathLike[str], columns: int, rows: int, pitch: Any, origin: Any = None) -> VectorGeometry:
+def read_rtk(
+    path: str | os.PathLike[str], columns: int, rows: int, pitch: Any, origin: Any = None
+) -> VectorGeometry:
     """A cone beam, view by view: for ``Projector`` and ``recon.analytic.fbp.fbp``.
 
     Args:
         path: XML file.
         columns, rows: of the projections.
         pitch: ``(row, column)`` spacing of the projections in mm, or one number.
-        origin: ``(row, column)`` detector coordinates in mm of the first pixel; None: the middle of the image is 0.
+        origin: ``(row, column)`` detector coordinates in mm of the first pixel; None: the middle of
+            the image is 0.
 
     Raises:
-        FileNotFoundError: no such file. ValueError: damaged, no projections, a matrix that is no projection.
+        FileNotFoundError: no such file. ValueError: damaged, no projections, a matrix that is no
+            projection.
     """
     whole("columns", columns), whole("rows", rows)
     dv, du = per_axis("pitch", pitch, 2, positive=True, unit="mm")
-    v0, u0 = (-(rows - 1) / 2 * dv, -(columns - 1) / 2 * du) if origin is None else per_axis("origin", origin, 2)
+    v0, u0 = (
+        (-(rows - 1) / 2 * dv, -(columns - 1) / 2 * du)
+        if origin is None
+        else per_axis("origin", origin, 2)
+    )
     u, v = u0 + (columns - 1) / 2 * du, v0 + (rows - 1) / 2 * dv
     text = read_text(path, "an RTK geometry")
     with reading(path, "an RTK geometry"):
@@ -70,5 +78,10 @@ def _vector(p: Any, sdd: float, middle: tuple[float, float], step: tuple[float, 
     # The plane at distance sdd along the detector's normal.
     normal = np.cross(inverse[:, 0], inverse[:, 1])
     scale = sdd / abs(float(centre @ normal) / float(np.linalg.norm(normal)))
-    parts = (source, source + scale * centre, scale * step[0] * inverse[:, 0], scale * step[1] * inverse[:, 1])
+    parts = (
+        source,
+        source + scale * centre,
+        scale * step[0] * inverse[:, 0],
+        scale * step[1] * inverse[:, 1],
+    )
     return np.concatenate([_OURS @ part for part in parts])

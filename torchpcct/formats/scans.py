@@ -38,7 +38,8 @@ class _Reader(NamedTuple):
         name: of the format, in messages.
         endings: of its files.
         is_one: whether a file of such an ending is of the format.
-        read: function of the path, and of the geometry if ``geometry`` is not "own", and of its options.
+        read: function of the path, and of the geometry if ``geometry`` is not "own", and of its
+            options.
         options: that it takes itself: what has to be known while reading, or is the format's own.
         geometry: "own": the files hold it, "given": they do not, "both": some do.
     """
@@ -74,7 +75,9 @@ _READERS = (
         lambda path, **options: read_dicom_ct_pd(path, **options).scan(),
         frozenset({"ignore_flying_spot", "spot"}),
     ),
-    _Reader("a torchpcct scan", _HDF5, lambda path: _is_own(path), Scan.load, frozenset({"slices"})),
+    _Reader(
+        "a torchpcct scan", _HDF5, lambda path: _is_own(path), Scan.load, frozenset({"slices"})
+    ),
     _Reader(
         "Data Exchange",
         _HDF5,
@@ -106,7 +109,9 @@ _READERS = (
         "given",
     ),
     _Reader("CatSim's readings", _CATSIM, _any, _catsim, frozenset(_COUNTS), "given"),
-    _Reader("a Nikon scan", (".xtekct",), _any, read_xtekct, frozenset({"slices"} | _FRAMES | _COUNTS)),
+    _Reader(
+        "a Nikon scan", (".xtekct",), _any, read_xtekct, frozenset({"slices"} | _FRAMES | _COUNTS)
+    ),
     _Reader("a Zeiss scan", (".txrm",), _any, read_txrm, frozenset({"slices"} | _FRAMES | _COUNTS)),
     _Reader(
         "a MATLAB array",
@@ -124,34 +129,42 @@ _ANY = {"axis", "pitch", "slices", "mu_water", "photons"}
 
 
 def check_scan_name(path: str | os.PathLike[str]) -> None:
-    """Raise ``ValueError`` unless the ending of ``path`` names a scan format (a folder: DICOM-CT-PD)."""
+    """Raise ``ValueError`` unless the ending of ``path`` names a scan format (a folder:
+    DICOM-CT-PD)."""
     name = Path(path)
     if not (name.is_dir() or any(name.suffix.lower() in reader.endings for reader in _READERS)):
         raise ValueError(
-            f"unknown scan format {name.name!r}: use .h5 (torchpcct, Data Exchange or NeXus), .yaml (TIFF, NumPy or "
-            "MATLAB stack), .xtekct (Nikon), .txrm (Zeiss), .mat (MATLAB), .prep or .scan (CatSim), or a folder of "
+            f"unknown scan format {name.name!r}: use .h5 (torchpcct, Data Exchange or NeXus), "
+            ".yaml (TIFF, NumPy or "
+            "MATLAB stack), .xtekct (Nikon), .txrm (Zeiss), .mat (MATLAB), .prep or .scan "
+            "(CatSim), or a folder of "
             "DICOM-CT-PD files"
         )
 
 
-def open_scan(path: str | os.PathLike[str], geometry: Geometry | None = None, **options: Any) -> Scan:
+def open_scan(
+    path: str | os.PathLike[str], geometry: Geometry | None = None, **options: Any
+) -> Scan:
     """A scan from a file or folder, by its ending and contents.
 
     Args:
-        path: ``.h5`` (torchpcct, Data Exchange or NeXus by its contents), ``.yaml``, Nikon's ``.xtekct``, Zeiss'
-            ``.txrm``, ``.mat``, CatSim's ``.prep`` or ``.scan``, or a folder of DICOM-CT-PD files.
-        geometry: of files that do not hold one (CatSim, MATLAB, a stack without); or, for any file, a
-            :class:`~torchpcct.vector_geometry.VectorGeometry` that takes the place of the nominal one. The slices of a
-            parallel stack are then the detector's rows, if it has rows.
-        options: of :func:`adapted`, for every format; of :meth:`torchpcct.Scan.from_counts` for Data Exchange, NeXus,
-            Nikon and Zeiss, of it or :meth:`torchpcct.Scan.from_line_integrals` for CatSim and MATLAB; ``angles_deg``
-            and, there and for the microscopes, ``air`` and ``dark`` in the place of what the file holds; ``entry`` of
-            NeXus, ``variable`` of MATLAB; ``spot`` and ``ignore_flying_spot`` of DICOM-CT-PD.
+        path: ``.h5`` (torchpcct, Data Exchange or NeXus by its contents), ``.yaml``, Nikon's
+            ``.xtekct``, Zeiss' ``.txrm``, ``.mat``, CatSim's ``.prep`` or ``.scan``, or a folder of
+            DICOM-CT-PD files.
+        geometry: of files that do not hold one (CatSim, MATLAB, a stack without); or, for any file,
+            a :class:`~torchpcct.vector_geometry.VectorGeometry` that takes the place of the nominal
+            one. The slices of a parallel stack are then the detector's rows, if it has rows.
+        options: of :func:`adapted`, for every format; of :meth:`torchpcct.Scan.from_counts` for
+            Data Exchange, NeXus, Nikon and Zeiss, of it or
+            :meth:`torchpcct.Scan.from_line_integrals` for CatSim and MATLAB; ``angles_deg`` and,
+            there and for the microscopes, ``air`` and ``dark`` in the place of what the file holds;
+            ``entry`` of NeXus, ``variable`` of MATLAB; ``spot`` and ``ignore_flying_spot`` of
+            DICOM-CT-PD.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: an unknown ending, a damaged file, a geometry that is missing or too many, an option that this scan
-            cannot follow.
+        ValueError: an unknown ending, a damaged file, a geometry that is missing or too many, an
+            option that this scan cannot follow.
         TypeError: an option that the format does not take.
     """
     check_scan_name(path)
@@ -161,13 +174,16 @@ def open_scan(path: str | os.PathLike[str], geometry: Geometry | None = None, **
     unknown = sorted(set(options) - _ANY - reader.options)
     if unknown:
         takes = sorted(_ANY | reader.options)
-        raise TypeError(f"{', '.join(unknown)}: no option of {reader.name}, which takes {', '.join(takes)}")
+        raise TypeError(
+            f"{', '.join(unknown)}: no option of {reader.name}, which takes {', '.join(takes)}"
+        )
     rest = {k: v for k, v in options.items() if k not in own and k in _ANY}
     return adapted(_read(name, reader, geometry, own), **rest)
 
 
 def own_options(path: str | os.PathLike[str]) -> set[str]:
-    """Options that the reader of a file takes itself; with "slices" it reads no more of the file than those."""
+    """Options that the reader of a file takes itself; with "slices" it reads no more of the file
+    than those."""
     check_scan_name(path)
     return set(_reader(Path(path)).options)
 
@@ -184,19 +200,23 @@ def _reader(name: Path) -> _Reader:
         if name.suffix.lower() in reader.endings and reader.is_one(name):
             return reader
     raise ValueError(
-        f"{name} is no scan of a known format: neither of torchpcct, nor Data Exchange (/exchange/data), nor NeXus "
+        f"{name} is no scan of a known format: neither of torchpcct, nor Data Exchange "
+        "(/exchange/data), nor NeXus "
         "(image_key)"
     )
 
 
 def _read(name: Path, reader: _Reader, geometry: Geometry | None, options: dict[str, Any]) -> Scan:
     if reader.geometry == "given" and geometry is None:
-        raise ValueError(f"{name.name}, {reader.name}: such files do not hold the geometry, give it")
+        raise ValueError(
+            f"{name.name}, {reader.name}: such files do not hold the geometry, give it"
+        )
     if reader.geometry != "own":
         return reader.read(name, geometry, **options)
     if geometry is not None and not isinstance(geometry, VectorGeometry):
         raise ValueError(
-            f"{name.name} holds its geometry: leave out geometry, or give a VectorGeometry (kind: vectors) in its place"
+            f"{name.name} holds its geometry: leave out geometry, or give a VectorGeometry (kind: "
+            "vectors) in its place"
         )
     scan = reader.read(name, **options)
     return scan if geometry is None else _placed(scan, geometry)
@@ -217,7 +237,8 @@ def adapted(
         scan: of any format.
         axis: column that the rotation axis projects onto (may be fractional).
         pitch: cell width in mm, of parallel beams.
-        slices: of parallel and fan beams ``(slices, views, columns)``: those to keep; of a cone beam its rows.
+        slices: of parallel and fan beams ``(slices, views, columns)``: those to keep; of a cone
+            beam its rows.
         mu_water: attenuation of water in mm⁻¹: volumes in HU.
         photons: of an unattenuated reading, of scans that were given as line integrals.
 
@@ -232,30 +253,45 @@ def adapted(
         g = scan.geometry
     if pitch is not None:
         if not isinstance(g, ParallelBeam):
-            raise ValueError(f"pitch= is the cell width of parallel beams, this is a {kind}: its geometry says it")
+            raise ValueError(
+                f"pitch= is the cell width of parallel beams, this is a {kind}: its geometry says "
+                "it"
+            )
         wide = number("pitch", pitch, positive=True, unit="mm")
         g = replace(g, pitch=wide, offset=g.offset * wide / g.pitch)
         scan = replace(scan, geometry=g, unit="mm^-1" if scan.unit == "pixel^-1" else scan.unit)
     if axis is not None:
         if isinstance(g, VectorGeometry) or scan.window is not None:
-            raise ValueError(f"axis= needs the whole detector of a scan on a circle, this is a {kind}")
-        scan = replace(scan, geometry=at_axis(g, number("axis", axis, low=0.0, high=g.columns - 1.0)))
+            raise ValueError(
+                f"axis= needs the whole detector of a scan on a circle, this is a {kind}"
+            )
+        scan = replace(
+            scan, geometry=at_axis(g, number("axis", axis, low=0.0, high=g.columns - 1.0))
+        )
     if mu_water is not None:
         mu = number("mu_water", mu_water, positive=True, unit="mm⁻¹")
         if scan.unit != "mm^-1":
             known = (
                 "it does not know the size of its pixels: give pitch=, too"
                 if scan.unit == "pixel^-1"
-                else (f"the attenuation of water, {scan.linearisation.mu_ref:.5g} mm⁻¹, is known to the scan")
+                else (
+                    f"the attenuation of water, {scan.linearisation.mu_ref:.5g} mm⁻¹, is known to "
+                    "the scan"
+                )
             )
             raise ValueError(f"mu_water= does not fit this scan: {known}")
         scan = replace(scan, linearisation=replace(scan.linearisation, mu_ref=mu), unit="HU")
     if photons is not None:
         if not scan.logged:
-            raise ValueError("photons= belongs to line integrals, this scan holds readings, which tell their photons")
+            raise ValueError(
+                "photons= belongs to line integrals, this scan holds readings, which tell their "
+                "photons"
+            )
         air = torch.full_like(scan.air, number("photons", photons, positive=True))
         ratio = (air / scan.air).unsqueeze(-len(g.shape))
-        scan = replace(scan, counts=scan.counts * ratio, air=air, info={**scan.info, "photons": "given"})
+        scan = replace(
+            scan, counts=scan.counts * ratio, air=air, info={**scan.info, "photons": "given"}
+        )
     return scan
 
 
@@ -264,7 +300,13 @@ def _sliced(scan: Scan, slices: slice) -> Scan:
     geometry, kept = sliced(scan.geometry, slices, scan.counts.shape[axis])
     at = (slice(None),) * axis + (slice(*kept[:2]),)
     changed = scan.each(lambda readings: readings[at])
-    return replace(scan, geometry=geometry, air=scan.air[at[-1:]], info={**scan.info, "slices": kept}, **changed)
+    return replace(
+        scan,
+        geometry=geometry,
+        air=scan.air[at[-1:]],
+        info={**scan.info, "slices": kept},
+        **changed,
+    )
 
 
 def _placed(scan: Scan, geometry: VectorGeometry) -> Scan:

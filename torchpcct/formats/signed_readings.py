@@ -12,16 +12,21 @@ __all__ = ["unwrapped"]
 
 
 def unwrapped(arrays: Mapping[str, Any], what: str) -> dict[str, Any]:
-    """Readings of a scan, those that were stored as signed integers though a detector counts from 0 read as unsigned.
+    """Readings of a scan, those that were stored as signed integers though a detector counts from 0
+    read as unsigned.
 
-    A camera's 16 bits reach 65535; stored as int16, what exceeds 32767 comes out far below 0. A few counts below 0, of
-    readings whose dark was taken off, stay.
+    A camera's 16 bits reach 65535; stored as int16, what exceeds 32767 comes out far below 0. A few
+    counts below 0, of readings whose dark was taken off, stay.
 
     Args:
         arrays: of one scan, by name.
         what: they are of, for the warning.
     """
-    signed = {k: a for k, a in ((k, np.asarray(v)) for k, v in arrays.items()) if a.dtype.kind == "i" and a.ndim}
+    signed = {
+        k: a
+        for k, a in ((k, np.asarray(v)) for k, v in arrays.items())
+        if a.dtype.kind == "i" and a.ndim
+    }
     for name, values in signed.items():
         bits = 8 * values.dtype.itemsize
         negative = values[values < 0]
@@ -29,7 +34,8 @@ def unwrapped(arrays: Mapping[str, Any], what: str) -> dict[str, Any]:
             continue
         same = [k for k, v in signed.items() if v.dtype == values.dtype]
         warnings.warn(
-            f"{what}: {name} of type int{bits} reach down to {int(negative.min())}: they are read as uint{bits}, as a "
+            f"{what}: {name} of type int{bits} reach down to {int(negative.min())}: they are read "
+            f"as uint{bits}, as a "
             "detector counts",
             UserWarning,
             stacklevel=2,

@@ -1,4 +1,5 @@
-"""Projections as TIFF, NumPy, Zarr or MATLAB files, described by a YAML file beside them: :data:`EXAMPLE`."""
+"""Projections as TIFF, NumPy, Zarr or MATLAB files, described by a YAML file beside them:
+:data:`EXAMPLE`."""
 
 from __future__ import annotations
 
@@ -23,18 +24,22 @@ __all__ = ["EXAMPLE", "read_stack"]
 
 EXAMPLE = """\
 # A stack of projections: torchpcct reconstruct scan.yaml; files are looked for beside this one
-readings: proj/*.tif        # a pattern, in the order of the numbers in the names, or a list; or one .npy, .zarr, .tif
+readings: proj/*.tif        # a pattern, in the order of the numbers in the names, or a list; or one
+                            # .npy, .zarr, .tif
 kind: counts                # or line_integrals: -ln of the transmission
-air: flat.tif               # of counts, without the object: a file, a pattern (several frames) or a number
+air: flat.tif               # of counts, without the object: a file, a pattern (several frames) or
+                            # a number
 dark: dark.npy              # optional, of counts without beam; as air
 # dead: dead.npy            # optional: mask, 1 where a cell is dead
-# gain: 12.5                # optional, of counts: reading of one photon (default: from the noise of several air frames)
+# gain: 12.5                # optional, of counts: reading of one photon (default: from the noise of
+                            # several air frames)
 # electronic_noise: 2.0     # optional, of counts: standard deviation in photons
 # photons: 20000            # optional, of line_integrals: of an unattenuated reading
 # mu_water: 0.02            # optional: attenuation of water in 1/mm, for HU
 # linearisation: [1.0, 0.02]  # optional: beam hardening, c1 p + c2 p^2 + …
 geometry:
-  kind: cone                # parallel, fan or cone; vectors and rtk: torchpcct/formats/geometry_yaml.py
+  kind: cone                # parallel, fan or cone; vectors and rtk:
+                            # torchpcct/formats/geometry_yaml.py
   angles_deg: {start: 0, step: 0.5, count: 720}   # or a list, or a text file with one angle a line
   sod: 626                  # mm, source to rotation axis (not parallel)
   sdd: 1098                 # mm, source to detector (not parallel)
@@ -45,26 +50,41 @@ geometry:
   detector: flat            # or curved
 """
 
-_COUNTS = {"air", "dark", "dead", "flux", "gain", "electronic_noise", "linearisation", "mu_water", "exposure_s"}
+_COUNTS = {
+    "air",
+    "dark",
+    "dead",
+    "flux",
+    "gain",
+    "electronic_noise",
+    "linearisation",
+    "mu_water",
+    "exposure_s",
+}
 _LINES = {"photons", "dead", "linearisation", "mu_water", "exposure_s"}
 _FILES = {"air", "dark", "dead", "flux", "photons"}
 
 
 def _is_name(value: Any) -> bool:
     """Whether a value is the name of a file, a pattern, or a list of names."""
-    listed = isinstance(value, list) and len(value) > 0 and all(isinstance(each, str) for each in value)
+    listed = (
+        isinstance(value, list) and len(value) > 0 and all(isinstance(each, str) for each in value)
+    )
     return listed or isinstance(value, str)
 
 
 def read_stack(
-    path: str | os.PathLike[str], geometry: Geometry | None = None, slices: slice | None = None, **known: Any
+    path: str | os.PathLike[str],
+    geometry: Geometry | None = None,
+    slices: slice | None = None,
+    **known: Any,
 ) -> Scan:
     """The scan that a YAML file describes; see :data:`EXAMPLE`.
 
     Args:
         path: YAML file.
-        geometry: where the file has none; a :class:`~torchpcct.vector_geometry.VectorGeometry` also in place of the
-            file's.
+        geometry: where the file has none; a :class:`~torchpcct.vector_geometry.VectorGeometry` also
+            in place of the file's.
         slices: those to read, of a cone beam its rows; None: all.
         known: values that take the place of the file's, e.g. ``gain``.
 
@@ -83,7 +103,9 @@ def read_stack(
         if geometry is None:
             geometry = geometry_of(described, folder)
         elif described is not None and not isinstance(geometry, VectorGeometry):
-            raise ValueError("it holds its geometry: leave out geometry, or give a VectorGeometry in its place")
+            raise ValueError(
+                "it holds its geometry: leave out geometry, or give a VectorGeometry in its place"
+            )
         name = given.pop("readings", None)
         if not _is_name(name):
             raise ValueError("readings must name a file, a pattern of files, or be a list of names")
@@ -91,11 +113,14 @@ def read_stack(
         unknown = sorted(map(str, set(given) - allowed))
         if unknown:
             raise ValueError(
-                f"unknown in a scan of {kind}: {', '.join(unknown)}; it takes {', '.join(sorted(allowed))}"
+                f"unknown in a scan of {kind}: {', '.join(unknown)}; it takes "
+                f"{', '.join(sorted(allowed))}"
             )
         if kind == "counts" and "air" not in given:
             raise ValueError("counts need air, the readings without the object")
-    options = {k: read_array(v, folder) if k in _FILES and _is_name(v) else v for k, v in given.items()}
+    options = {
+        k: read_array(v, folder) if k in _FILES and _is_name(v) else v for k, v in given.items()
+    }
     if "dead" in options:
         options["dead"] = np.asarray(options["dead"]).astype(bool)
     info: dict[str, Any] = {"file": str(path), "format": "stack"}
@@ -119,7 +144,8 @@ def read_stack(
         first, stop, count = info["slices"]
         geometry = sliced(geometry, slices, count)[0]
         for key in _FILES & set(options):
-            # One value a cell, (…, slices, columns), or one a reading of a stack, (slices, views, columns).
+            # One value a cell, (…, slices, columns), or one a reading of a stack, (slices, views,
+            # columns).
             shape = np.shape(options[key])
             if len(shape) > 1 and shape[-2] == count:
                 options[key] = options[key][..., first:stop, :]

@@ -1,7 +1,9 @@
-"""Volumes as NIfTI and MetaImage, and the names of all formats: what :class:`torchpcct.volume.Volume` saves and loads.
+"""Volumes as NIfTI and MetaImage, and the names of all formats: what
+:class:`torchpcct.volume.Volume` saves and loads.
 
-The scanner's x, y, z are taken for right, anterior, superior: NIfTI's axes. DICOM and ITK have x and y the other way,
-so the same point carries the opposite sign there; every reader shows the same volume at the same place.
+The scanner's x, y, z are taken for right, anterior, superior: NIfTI's axes. DICOM and ITK have x
+and y the other way, so the same point carries the opposite sign there; every reader shows the same
+volume at the same place.
 """
 
 from __future__ import annotations
@@ -19,7 +21,13 @@ from typing import Any
 
 import numpy as np
 
-from torchpcct.files import atomic_write, is_own_hdf5, require_folder, require_ordinary, require_writable
+from torchpcct.files import (
+    atomic_write,
+    is_own_hdf5,
+    require_folder,
+    require_ordinary,
+    require_writable,
+)
 from torchpcct.formats.damage import check_expansion, check_size, needed, reading
 from torchpcct.formats.dicom_series import DICOM_ENDINGS, check_series
 from torchpcct.formats.volume_grid import STRAIGHT, grid_from
@@ -39,21 +47,29 @@ __all__ = [
     "write_nifti",
 ]
 
-ENDINGS = {"NIfTI": (".nii", ".nii.gz"), "MetaImage": (".mha",), "HDF5": (".h5", ".hdf5"), "OME-Zarr": (".zarr",)}
-"""Of files, and of the folder of an OME-Zarr; a name without ending is a folder for a DICOM series."""
+ENDINGS = {
+    "NIfTI": (".nii", ".nii.gz"),
+    "MetaImage": (".mha",),
+    "HDF5": (".h5", ".hdf5"),
+    "OME-Zarr": (".zarr",),
+}
+"""Of files, and of the folder of an OME-Zarr; a name without ending is a folder for a DICOM
+series."""
 
 _ENDING = re.compile(r"\.[A-Za-z][A-Za-z0-9]{0,7}$")
 """What is meant to name a format."""
 _MADE_BY = "torchpcct, "
 _MM = {0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3}
-"""Millimetres of NIfTI's units of length: unknown (in practice mm), metre, millimetre, micrometre."""
+"""Millimetres of NIfTI's units of length: unknown (in practice mm), metre, millimetre,
+micrometre."""
 _AFTER_VOXELS = 2**20
 """Bytes that may stand behind the voxels of a packed NIfTI."""
 
 
 def format_of(path: str | os.PathLike[str]) -> str:
-    """Name of the format that the ending of ``path`` stands for, in any capitals; a file of one DICOM image is "DICOM",
-    too, and so is any folder: dots in the names of archives (``1.2.840.113619``) are no endings.
+    """Name of the format that the ending of ``path`` stands for, in any capitals; a file of one
+    DICOM image is "DICOM", too, and so is any folder: dots in the names of archives
+    (``1.2.840.113619``) are no endings.
 
     Raises:
         ValueError: another ending.
@@ -62,17 +78,26 @@ def format_of(path: str | os.PathLike[str]) -> str:
     for form, endings in ENDINGS.items():
         if name.endswith(endings):
             return form
-    if ending.lower() in DICOM_ENDINGS or Path(path).is_dir() or (name not in ("", "..") and not _ENDING.match(ending)):
+    if (
+        ending.lower() in DICOM_ENDINGS
+        or Path(path).is_dir()
+        or (name not in ("", "..") and not _ENDING.match(ending))
+    ):
         return "DICOM"
     known = ", ".join(e for endings in ENDINGS.values() for e in endings)
-    raise ValueError(f"unknown volume format {Path(path).name!r}: use {known}, or no ending for a DICOM series")
+    raise ValueError(
+        f"unknown volume format {Path(path).name!r}: use {known}, or no ending for a DICOM series"
+    )
 
 
 def check_volume_name(path: str | os.PathLike[str]) -> None:
-    """Raise ``ValueError`` unless the ending of ``path`` names a volume format that is written; none: a folder for a
-    DICOM series."""
+    """Raise ``ValueError`` unless the ending of ``path`` names a volume format that is written;
+    none: a folder for a DICOM series."""
     if format_of(path) == "DICOM" and Path(path).suffix.lower() in DICOM_ENDINGS:
-        raise ValueError(f"{Path(path).name!r} would be one slice: a DICOM series is a folder, a name without ending")
+        raise ValueError(
+            f"{Path(path).name!r} would be one slice: a DICOM series is a folder, a name without "
+            "ending"
+        )
 
 
 def check_target(path: str | os.PathLike[str], voxels: int = 0, unit: str = "HU") -> None:
@@ -84,8 +109,8 @@ def check_target(path: str | os.PathLike[str], voxels: int = 0, unit: str = "HU"
         unit: HU or mm^-1.
 
     Raises:
-        ValueError: an unknown ending, a folder in the place of a file, a series into a folder that holds something, or
-            in another unit than HU.
+        ValueError: an unknown ending, a folder in the place of a file, a series into a folder that
+            holds something, or in another unit than HU.
         OSError: nothing can be written there, or less than the volume needs.
         ImportError: the package that writes the format is not installed.
     """
@@ -104,7 +129,10 @@ def check_target(path: str | os.PathLike[str], voxels: int = 0, unit: str = "HU"
     least = 0 if compressed else voxels * (2 if form == "DICOM" else 4)
     free = shutil.disk_usage(target.parent).free
     if least > free:
-        raise OSError(f"{target} needs {least / 2**30:.2f} GiB, {free / 2**30:.2f} GiB are free: name another folder")
+        raise OSError(
+            f"{target} needs {least / 2**30:.2f} GiB, {free / 2**30:.2f} GiB are free: name "
+            "another folder"
+        )
 
 
 def is_own_volume(path: str | os.PathLike[str]) -> bool:
@@ -119,7 +147,10 @@ def is_own_volume(path: str | os.PathLike[str]) -> bool:
         return is_own_hdf5(path, "volume")
     if form == "OME-Zarr":
         try:
-            return "torchpcct" in json.loads((Path(path) / "zarr.json").read_text(encoding="utf-8"))["attributes"]
+            return (
+                "torchpcct"
+                in json.loads((Path(path) / "zarr.json").read_text(encoding="utf-8"))["attributes"]
+            )
         except (OSError, ValueError, KeyError, TypeError):
             return False
     try:
@@ -132,7 +163,8 @@ def is_own_volume(path: str | os.PathLike[str]) -> bool:
 
 
 def _unit(written: str, name: str, given: str | None) -> str:
-    """The unit that a file of ours names; files of other software (``written`` empty) are in what was ``given``, or HU.
+    """The unit that a file of ours names; files of other software (``written`` empty) are in what
+    was ``given``, or HU.
 
     Raises:
         ValueError: another unit, or a given one that is not the file's.
@@ -145,16 +177,20 @@ def _unit(written: str, name: str, given: str | None) -> str:
 
 
 def write_nifti(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
-    """Write NIfTI-1, float32, mm, RAS, with qform and sform (scanner coordinates); the unit stands in ``descrip``."""
+    """Write NIfTI-1, float32, mm, RAS, with qform and sform (scanner coordinates); the unit
+    stands in ``descrip``."""
     import nibabel
 
     # NIfTI stores (x, y, z).
-    image = nibabel.Nifti1Image(np.asarray(data, dtype=np.float32).transpose(2, 1, 0), None, nifti_header(grid, unit))
+    image = nibabel.Nifti1Image(
+        np.asarray(data, dtype=np.float32).transpose(2, 1, 0), None, nifti_header(grid, unit)
+    )
     with atomic_write(path) as part, part.open("wb") as raw:
         if not str(path).endswith(".gz"):
             image.to_stream(raw)
         else:
-            with gzip.GzipFile("", "wb", compresslevel=1, fileobj=raw, mtime=0) as packed:  # the same for the same
+            # the same for the same
+            with gzip.GzipFile("", "wb", compresslevel=1, fileobj=raw, mtime=0) as packed:
                 image.to_stream(packed)
 
 
@@ -175,19 +211,22 @@ def nifti_header(grid: VolumeGrid, unit: str) -> Any:
     return header
 
 
-def read_nifti(path: str | os.PathLike[str], unit: str | None = None) -> tuple[Any, VolumeGrid, str]:
-    """Data ``(z, y, x)`` float32, grid in mm and unit of a NIfTI volume, axes in any order or direction.
+def read_nifti(
+    path: str | os.PathLike[str], unit: str | None = None
+) -> tuple[Any, VolumeGrid, str]:
+    """Data ``(z, y, x)`` float32, grid in mm and unit of a NIfTI volume, axes in any order or
+    direction.
 
-    Lengths are in the file's unit (metres, millimetres, micrometres; mm where it is unknown). Axes of one behind the
-    third are left out.
+    Lengths are in the file's unit (metres, millimetres, micrometres; mm where it is unknown). Axes
+    of one behind the third are left out.
 
     Args:
         path: ``.nii`` or ``.nii.gz``.
         unit: of the numbers of other software's files; None: HU.
 
     Raises:
-        FileNotFoundError: no such file. ValueError: damaged, several volumes, oblique, or an affine without inverse; a
-            volume of ours in an unknown unit, or in another than ``unit``.
+        FileNotFoundError: no such file. ValueError: damaged, several volumes, oblique, or an affine
+            without inverse; a volume of ours in an unknown unit, or in another than ``unit``.
     """
     import nibabel
 
@@ -219,16 +258,21 @@ def read_nifti(path: str | os.PathLike[str], unit: str | None = None) -> tuple[A
         if not np.isfinite(affine).all():
             raise ValueError("its affine is not finite")
         spacing = np.diag(matrix).copy()
-        if (spacing <= 0).any() or np.abs(matrix - np.diag(spacing)).max() > STRAIGHT * spacing.max():
+        if (spacing <= 0).any() or np.abs(
+            matrix - np.diag(spacing)
+        ).max() > STRAIGHT * spacing.max():
             raise ValueError("its axes are oblique: resample it to straight axes first")
         text = bytes(image.header["descrip"]).rstrip(b"\0").decode("ascii", "replace")
-        unit = _unit(text.removeprefix(_MADE_BY) if text.startswith(_MADE_BY) else "", "descrip", unit)
+        unit = _unit(
+            text.removeprefix(_MADE_BY) if text.startswith(_MADE_BY) else "", "descrip", unit
+        )
         data = np.asarray(image.dataobj, dtype=np.float32).transpose(2, 1, 0)
         return np.ascontiguousarray(data), grid_from(data.shape, spacing, affine[:3, 3]), unit
 
 
 def _check_packed(path: str | os.PathLike[str]) -> None:
-    """Unpack a ``.nii.gz`` to its end, where its checksum stands: NiBabel stops after the last voxel.
+    """Unpack a ``.nii.gz`` to its end, where its checksum stands: NiBabel stops after the last
+    voxel.
 
     Raises:
         ValueError: it holds more than its header says.
@@ -237,7 +281,11 @@ def _check_packed(path: str | os.PathLike[str]) -> None:
 
     with gzip.open(path) as file:
         begin = file.read(1024)
-        header: Any = nibabel.Nifti1Header if begin[:4] in (b"\x5c\x01\0\0", b"\0\0\x01\x5c") else nibabel.Nifti2Header
+        header: Any = (
+            nibabel.Nifti1Header
+            if begin[:4] in (b"\x5c\x01\0\0", b"\0\0\x01\x5c")
+            else nibabel.Nifti2Header
+        )
         held = header.from_fileobj(io.BytesIO(begin), check=False)
         bits, shape = int(held["bitpix"]), held.get_data_shape()
         check_size(shape, "the volume")
@@ -246,7 +294,9 @@ def _check_packed(path: str | os.PathLike[str]) -> None:
         while part := file.read(2**24):
             total += len(part)
             if total > most:
-                raise ValueError(f"it unpacks to more than the {most - _AFTER_VOXELS} bytes that its header says")
+                raise ValueError(
+                    f"it unpacks to more than the {most - _AFTER_VOXELS} bytes that its header says"
+                )
 
 
 def write_meta_image(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
@@ -275,9 +325,11 @@ def write_meta_image(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, 
         file.write(packed)
 
 
-def read_meta_image(path: str | os.PathLike[str], unit: str | None = None) -> tuple[Any, VolumeGrid, str]:
-    """Data ``(z, y, x)`` float32, grid and unit of a MetaImage by SimpleITK; arguments and errors as
-    :func:`read_nifti`."""
+def read_meta_image(
+    path: str | os.PathLike[str], unit: str | None = None
+) -> tuple[Any, VolumeGrid, str]:
+    """Data ``(z, y, x)`` float32, grid and unit of a MetaImage by SimpleITK; arguments and errors
+    as :func:`read_nifti`."""
     sitk = needed("SimpleITK")
     with reading(path, "a MetaImage"):
         reader = sitk.ImageFileReader()
@@ -285,8 +337,15 @@ def read_meta_image(path: str | os.PathLike[str], unit: str | None = None) -> tu
         reader.ReadImageInformation()
         check_size(reader.GetSize(), "the volume")
         if reader.GetDimension() != 3 or reader.GetNumberOfComponents() != 1:
-            raise ValueError(f"it has {reader.GetDimension()} axes of {reader.GetNumberOfComponents()} components")
-        unit = _unit(reader.GetMetaData("Unit").strip() if reader.HasMetaDataKey("Unit") else "", "field Unit", unit)
+            raise ValueError(
+                f"it has {reader.GetDimension()} axes of {reader.GetNumberOfComponents()} "
+                "components"
+            )
+        unit = _unit(
+            reader.GetMetaData("Unit").strip() if reader.HasMetaDataKey("Unit") else "",
+            "field Unit",
+            unit,
+        )
         check_expansion(reader.GetSize(), "the volume", os.stat(path).st_size)
         _check_compressed(Path(path).read_bytes())
         image = sitk.DICOMOrient(reader.Execute(), "RAS")
@@ -299,7 +358,8 @@ def read_meta_image(path: str | os.PathLike[str], unit: str | None = None) -> tu
 
 
 def _check_compressed(content: bytes) -> None:
-    """Raise where the compressed voxels of a MetaImage are damaged: ITK fills what it cannot unpack with anything."""
+    """Raise where the compressed voxels of a MetaImage are damaged: ITK fills what it cannot
+    unpack with anything."""
     mark = b"ElementDataFile = LOCAL\n"
     header, found, packed = content.partition(mark)
     if not found or b"CompressedData = True" not in header:

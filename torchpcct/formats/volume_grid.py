@@ -18,4 +18,6 @@ def grid_from(shape: tuple[int, ...], spacing: Any, first: Any) -> VolumeGrid:
     """Grid from spacing and first voxel, both x, y, z in mm."""
     s, f = np.asarray(spacing, dtype=np.float64)[::-1], np.asarray(first, dtype=np.float64)[::-1]
     center = f + s * (np.array(shape) - 1) / 2
-    return VolumeGrid(tuple(int(n) for n in shape), tuple(float(v) for v in s), tuple(float(v) for v in center))
+    return VolumeGrid(
+        tuple(int(n) for n in shape), tuple(float(v) for v in s), tuple(float(v) for v in center)
+    )

@@ -1,7 +1,9 @@
-"""Volumes that are written slab by slab along z, larger than memory: NIfTI (``.nii``) and OME-Zarr (``.zarr``).
+"""Volumes that are written slab by slab along z, larger than memory: NIfTI (``.nii``) and OME-Zarr
+(``.zarr``).
 
-What is not complete stands beside its place, with ``.unfinished`` behind its name, and what is in it already in a
-journal (``.unfinished.json``). Nothing takes the name that was asked for before the last slab is on the disk.
+What is not complete stands beside its place, with ``.unfinished`` behind its name, and what is in
+it already in a journal (``.unfinished.json``). Nothing takes the name that was asked for before the
+last slab is on the disk.
 """
 
 from __future__ import annotations
@@ -36,23 +38,26 @@ _CHUNK_PLANE = 256
 
 
 def check_slab_name(path: str | os.PathLike[str]) -> None:
-    """Raise ``ValueError`` unless the ending of ``path`` names a format that is written slab by slab."""
+    """Raise ``ValueError`` unless the ending of ``path`` names a format that is written slab by
+    slab."""
     if not str(path).endswith(SLAB_ENDINGS):
         raise ValueError(
-            f"{Path(path).name!r} cannot be written slab by slab: use .nii or .zarr (OME-Zarr); .nii.gz, .mha, .h5 and "
+            f"{Path(path).name!r} cannot be written slab by slab: use .nii or .zarr (OME-Zarr); "
+            ".nii.gz, .mha, .h5 and "
             "DICOM hold what fits into memory"
         )
 
 
 class SlabFile:
-    """A volume on the disk that grows slab by slab, and goes on where an earlier process was stopped.
+    """A volume on the disk that grows slab by slab, and goes on where an earlier process was
+    stopped.
 
     Args:
         path: ``.nii`` or ``.zarr``.
         grid: ``(z, y, x)`` of the whole volume.
         unit: of its values.
-        key: text that names all that the voxels depend on: what an earlier process wrote under another key is
-            begun anew.
+        key: text that names all that the voxels depend on: what an earlier process wrote under
+            another key is begun anew.
         chunk: slices of a chunk of Zarr.
 
     Attributes:
@@ -61,14 +66,16 @@ class SlabFile:
 
     Raises:
         ValueError: another ending.
-        FileExistsError: a folder of that name that holds anything else than such a volume, or files of others that
-            have the names of an unfinished one.
+        FileExistsError: a folder of that name that holds anything else than such a volume, or files
+            of others that have the names of an unfinished one.
         FileNotFoundError: the folder does not exist.
         WriteError: the system refuses to write.
         ImportError: ``zarr`` is not installed.
     """
 
-    def __init__(self, path: str | os.PathLike[str], grid: VolumeGrid, unit: str, key: str, chunk: int) -> None:
+    def __init__(
+        self, path: str | os.PathLike[str], grid: VolumeGrid, unit: str, key: str, chunk: int
+    ) -> None:
         check_slab_name(path)
         require_folder(path)
         self.path, self.grid, self.unit, self.key = Path(path), grid, unit, key
@@ -78,7 +85,8 @@ class SlabFile:
         for there in (self.part, self.journal):
             if not kept and (there.exists() or there.is_symlink()):
                 raise FileExistsError(
-                    f"{there} is there and is no unfinished volume of torchpcct: move it, or name another file than "
+                    f"{there} is there and is no unfinished volume of torchpcct: move it, or name "
+                    "another file than "
                     f"{path}"
                 )
         _require_own(self.path)
@@ -88,7 +96,8 @@ class SlabFile:
         if not resumed:
             with self._writing():
                 self.discard()
-                self._note(begun=False)  # before anything else, so that whatever is left says whose it is
+                # before anything else, so that whatever is left says whose it is
+                self._note(begun=False)
                 if self.path.suffix == ".zarr":
                     _create(self.part, grid, unit, chunk)
                 else:
@@ -100,13 +109,20 @@ class SlabFile:
         values, first = np.ascontiguousarray(data, dtype="<f4"), self.done
         with self._writing():
             if self.path.suffix == ".zarr":
-                _fill(needed("zarr").open_group(self.part, mode="r+"), slice(first, first + len(values)), values)
+                _fill(
+                    needed("zarr").open_group(self.part, mode="r+"),
+                    slice(first, first + len(values)),
+                    values,
+                )
                 if hasattr(os, "sync"):
                     os.sync()
             else:
                 # Not by a memory map, which a full disk ends with a signal instead of an error.
                 with self.part.open("r+b") as file:
-                    file.seek(len(_nifti_header(self.grid, self.unit)) + 4 * first * int(np.prod(self.grid.shape[1:])))
+                    file.seek(
+                        len(_nifti_header(self.grid, self.unit))
+                        + 4 * first * int(np.prod(self.grid.shape[1:]))
+                    )
                     file.write(values.data)
                     file.flush()
                     os.fsync(file.fileno())
@@ -114,7 +130,8 @@ class SlabFile:
             self._note()
 
     def finish(self, report: Mapping[str, Any]) -> None:
-        """Give the volume its name; an OME-Zarr keeps the report. What had the name before is gone then."""
+        """Give the volume its name; an OME-Zarr keeps the report. What had the name before is
+        gone then."""
         with self._writing():
             if self.path.suffix == ".zarr":
                 group = needed("zarr").open_group(self.part, mode="r+")
@@ -153,7 +170,8 @@ class SlabFile:
         except OSError as error:
             why = os.strerror(error.errno) if error.errno else str(error)
             kept = (
-                f"; its slabs up to now are kept in {self.part.name}, the same call goes on with them"
+                f"; its slabs up to now are kept in {self.part.name}, the same call goes on with "
+                "them"
                 if self.done
                 else ""
             )
@@ -161,7 +179,8 @@ class SlabFile:
 
 
 def _nifti_header(grid: VolumeGrid, unit: str) -> bytes:
-    """What stands before the voxels, as :func:`torchpcct.formats.volume_files.write_nifti` writes it."""
+    """What stands before the voxels, as :func:`torchpcct.formats.volume_files.write_nifti`
+    writes it."""
     return bytes(nifti_header(grid, unit).binaryblock) + bytes(4)
 
 
@@ -198,8 +217,13 @@ def _fill(group: Any, at: Any, values: Any) -> None:
 
 
 def _about(unit: str, report: Any = None) -> dict[str, Any]:
-    """What stands in the attributes beside the format's own; the digest is written by :func:`_seal`."""
-    return {"unit": unit, **({} if report is None else {"report": report}), "metadata": _DIGEST.format("0" * 64)}
+    """What stands in the attributes beside the format's own; the digest is written by
+    :func:`_seal`."""
+    return {
+        "unit": unit,
+        **({} if report is None else {"report": report}),
+        "metadata": _DIGEST.format("0" * 64),
+    }
 
 
 _DIGEST = "torchpcct-sha256:{}"
@@ -207,21 +231,24 @@ _DIGESTS = re.compile(rb"torchpcct-sha256:([0-9a-f]{64})")
 
 
 def _metadata_digest(path: Path) -> tuple[bytes, list[bytes]]:
-    """SHA-256 of what describes the voxels, with zeros in the place of the digests in it, and those."""
+    """SHA-256 of what describes the voxels, with zeros in the place of the digests in it, and
+    those."""
     parts = [(path / "zarr.json").read_bytes(), (path / "0" / "zarr.json").read_bytes()]
     clean = _DIGESTS.sub(b"torchpcct-sha256:" + b"0" * 64, parts[0])
     return hashlib.sha256(clean + b"\0" + parts[1]).hexdigest().encode(), _DIGESTS.findall(parts[0])
 
 
 def _seal(path: Path) -> None:
-    """Write the digest of the metadata into them; voxels have checksums of their own, one a chunk."""
+    """Write the digest of the metadata into them; voxels have checksums of their own, one a
+    chunk."""
     digest, _ = _metadata_digest(path)
     file = path / "zarr.json"
     file.write_bytes(_DIGESTS.sub(b"torchpcct-sha256:" + digest, file.read_bytes()))
 
 
 def _check_sealed(path: Path) -> None:
-    """Raise ``ValueError`` if the metadata of a volume of ours are not what they were when it was written.
+    """Raise ``ValueError`` if the metadata of a volume of ours are not what they were when it was
+    written.
 
     Earlier versions wrote no digest, and no checksums of chunks.
     """
@@ -231,14 +258,18 @@ def _check_sealed(path: Path) -> None:
     about, array = (name.read_bytes() for name in names)
     digest, written = _metadata_digest(path)
     if written and written != [digest]:
-        raise ValueError("its zarr.json is damaged: it does not have the checksum that it was written with")
+        raise ValueError(
+            "its zarr.json is damaged: it does not have the checksum that it was written with"
+        )
     for name, content in zip(("zarr.json", "0/zarr.json"), (about, array), strict=True):
         try:
             json.loads(content)
         except ValueError as error:
             raise ValueError(f"its {name} is damaged: {error}") from error
     if not written and b"torchpcct" in about and b"crc32c" in array:
-        raise ValueError("its zarr.json is damaged: the checksum that it was written with is not there")
+        raise ValueError(
+            "its zarr.json is damaged: the checksum that it was written with is not there"
+        )
 
 
 def write_ome_zarr(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
@@ -258,26 +289,33 @@ _OWN_FILES = re.compile(r"zarr\.json|0/zarr\.json|0/c(/\d+)+")
 
 
 def _require_own(path: str | os.PathLike[str]) -> None:
-    """Raise ``FileExistsError`` for a folder that a volume of this name would replace, and that holds anything else
-    than an OME-Zarr as it is written here."""
+    """Raise ``FileExistsError`` for a folder that a volume of this name would replace, and that
+    holds anything else than an OME-Zarr as it is written here."""
     folder = Path(path)
     if not folder.is_dir():
         return
     if folder.is_symlink():
-        raise FileExistsError(f"{folder} is a link to a folder: name another file, or remove the link")
+        raise FileExistsError(
+            f"{folder} is a link to a folder: name another file, or remove the link"
+        )
     files = {
-        file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_symlink() or not file.is_dir()
+        file.relative_to(folder).as_posix()
+        for file in folder.rglob("*")
+        if file.is_symlink() or not file.is_dir()
     }
     foreign = sorted(name for name in files if not _OWN_FILES.fullmatch(name))
     if files and not foreign:
         try:
-            attributes = json.loads((folder / "zarr.json").read_text(encoding="utf-8"))["attributes"]
+            attributes = json.loads((folder / "zarr.json").read_text(encoding="utf-8"))[
+                "attributes"
+            ]
             foreign = [] if "torchpcct" in attributes else ["zarr.json"]
         except (OSError, ValueError, TypeError, KeyError):
             foreign = ["zarr.json"]
     if foreign:
         raise FileExistsError(
-            f"{folder} is a folder that holds {foreign[0]}, which torchpcct did not write there: name another file, or "
+            f"{folder} is a folder that holds {foreign[0]}, which torchpcct did not write there: "
+            "name another file, or "
             "move the folder"
         )
 
@@ -289,8 +327,11 @@ def _remove_ome_zarr(folder: Path) -> None:
         shutil.rmtree(folder)
 
 
-def read_ome_zarr(path: str | os.PathLike[str], unit: str | None = None) -> tuple[Any, VolumeGrid, str]:
-    """Data ``(z, y, x)`` float32, grid in mm and unit of the first resolution of an OME-Zarr 0.4 or 0.5.
+def read_ome_zarr(
+    path: str | os.PathLike[str], unit: str | None = None
+) -> tuple[Any, VolumeGrid, str]:
+    """Data ``(z, y, x)`` float32, grid in mm and unit of the first resolution of an OME-Zarr 0.4 or
+    0.5.
 
     Axes of time and channel of one are left out.
 
@@ -300,7 +341,8 @@ def read_ome_zarr(path: str | os.PathLike[str], unit: str | None = None) -> tupl
 
     Raises:
         FileNotFoundError: no such folder.
-        ValueError: a damaged or lost part, which is named; other axes than z, y, x, an unknown unit of length.
+        ValueError: a damaged or lost part, which is named; other axes than z, y, x, an unknown unit
+            of length.
         ImportError: ``zarr`` is not installed.
     """
     zarr = needed("zarr")
@@ -313,10 +355,15 @@ def read_ome_zarr(path: str | os.PathLike[str], unit: str | None = None) -> tupl
         names = [axis["name"] for axis in image["axes"]]
         lead = len(names) - 3
         if names[lead:] != ["z", "y", "x"] or any(n != 1 for n in array.shape[:lead]):
-            raise ValueError(f"its axes are {', '.join(names)} of {array.shape}, expected one volume of z, y, x")
+            raise ValueError(
+                f"its axes are {', '.join(names)} of {array.shape}, expected one volume of z, y, x"
+            )
         units = [str(axis.get("unit", "millimeter")) for axis in image["axes"][lead:]]
         if not set(units) <= set(MM):
-            raise ValueError(f"its lengths are in {', '.join(sorted(set(units) - set(MM)))}, which is no known unit")
+            raise ValueError(
+                f"its lengths are in {', '.join(sorted(set(units) - set(MM)))}, which is no known "
+                "unit"
+            )
         lengths = [MM[name] for name in units]
         check_expansion(array.shape, "the volume", array.nbytes_stored)
         spacing, first = np.ones(3), np.zeros(3)
@@ -347,7 +394,8 @@ def _chunk_by_chunk(array: Any, folder: Path, whole: bool) -> Any:
     Args:
         array: Zarr array.
         folder: that it lies in.
-        whole: whether every chunk was written. Else those of nothing but the fill value may not be there.
+        whole: whether every chunk was written. Else those of nothing but the fill value may not be
+            there.
     """
     data = np.empty(array.shape, dtype=np.float32)
     counts = [math.ceil(n / c) for n, c in zip(array.shape, array.chunks, strict=True)]

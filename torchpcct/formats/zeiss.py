@@ -1,7 +1,8 @@
 """Scans of Zeiss (Xradia) X-ray microscopes: ``.txrm``, an OLE file of images with their angles.
 
-Names of the streams and the directions of columns, rows and angles as in dxchange and CIL's ``ZEISSDataReader``
-(https://github.com/TomographicImaging/CIL): columns and rows as they are, the source turns clockwise.
+Names of the streams and the directions of columns, rows and angles as in dxchange and CIL's
+``ZEISSDataReader`` (https://github.com/TomographicImaging/CIL): columns and rows as they are, the
+source turns clockwise.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ def read_txrm(
         path: ``.txrm`` file.
         slices: detector rows to read; None: all.
         air: reading without the object; None: the file's reference image.
-        dark, mu_water, options: of :meth:`torchpcct.Scan.from_counts`; ``gain`` by default from the noise.
+        dark, mu_water, options: of :meth:`torchpcct.Scan.from_counts`; ``gain`` by default from the
+            noise.
 
     Raises:
         FileNotFoundError: no such file.
@@ -59,7 +61,9 @@ def read_txrm(
     olefile = needed("olefile")
     with reading(path, "a Zeiss scan"), olefile.OleFileIO(os.fspath(path)) as file:
         held = _Streams(file)
-        width, height = (int(held.numbers(f"ImageInfo/Image{name}", "<u4")[0]) for name in ("Width", "Height"))
+        width, height = (
+            int(held.numbers(f"ImageInfo/Image{name}", "<u4")[0]) for name in ("Width", "Height")
+        )
         count = int(held.numbers("ImageInfo/NoOfImages", "<u4")[0])
         if file.exists("ImageInfo/ImagesTaken"):  # of a scan that was stopped
             count = min(count, int(held.numbers("ImageInfo/ImagesTaken", "<u4")[0]))
@@ -74,22 +78,30 @@ def read_txrm(
             rows = slice(*info["slices"][:2])
         readings = np.stack(
             [
-                held.image(f"ImageData{k // _A_STORAGE + 1}/Image{k + 1}", kind, height, width)[rows]
+                held.image(f"ImageData{k // _A_STORAGE + 1}/Image{k + 1}", kind, height, width)[
+                    rows
+                ]
                 for k in range(count)
             ]
         )
         if air is None:
             if not file.exists("ReferenceData/Image"):
-                raise ValueError("it has no reference image: give air=, the reading without the object")
+                raise ValueError(
+                    "it has no reference image: give air=, the reading without the object"
+                )
             of = "ReferenceData/DataType"
             reference = _type(held.numbers(of, "<u4")[0]) if file.exists(of) else kind
             air = held.image("ReferenceData/Image", reference, height, width)[rows]
         options.setdefault("gain", "noise")
-        arrays = unwrapped({"readings": readings, "air": given_array(air), "dark": given_array(dark)}, str(path))
+        arrays = unwrapped(
+            {"readings": readings, "air": given_array(air), "dark": given_array(dark)}, str(path)
+        )
         readings = arrays.pop("readings")
         if not geometry.has_rows:
             readings = np.moveaxis(readings, 0, 1)
-        return Scan.from_counts(readings, geometry, mu_water=mu_water, info=info, **arrays, **options)
+        return Scan.from_counts(
+            readings, geometry, mu_water=mu_water, info=info, **arrays, **options
+        )
 
 
 def _type(code: Any) -> str:
@@ -121,8 +133,19 @@ class _Streams:
 def _geometry(held: _Streams, count: int, height: int, width: int) -> Geometry:
     degrees = held.numbers("ImageInfo/Angles", "<f4", count).astype(np.float64)
     angles = -np.deg2rad(degrees) - np.pi / 2
-    cell = number("ImageInfo/PixelSize", held.numbers("ImageInfo/PixelSize", "<f4")[0], positive=True, unit="µm") * 1e-3
-    cone = not held.file.exists("ImageInfo/XrayGeometry") or held.numbers("ImageInfo/XrayGeometry", "<i4")[0] == _CONE
+    cell = (
+        number(
+            "ImageInfo/PixelSize",
+            held.numbers("ImageInfo/PixelSize", "<f4")[0],
+            positive=True,
+            unit="µm",
+        )
+        * 1e-3
+    )
+    cone = (
+        not held.file.exists("ImageInfo/XrayGeometry")
+        or held.numbers("ImageInfo/XrayGeometry", "<i4")[0] == _CONE
+    )
     if not cone:
         return ParallelBeam(angles, width, cell)
     sod, beyond = (
@@ -134,7 +157,12 @@ def _geometry(held: _Streams, count: int, height: int, width: int) -> Geometry:
     shifts = {}
     for axis, name in (("columns", "x"), ("rows", "y")):
         stream = next(
-            (s for s in (f"alignment/{name}-shifts", f"Alignment/{name.upper()}-Shifts") if held.file.exists(s)), None
+            (
+                s
+                for s in (f"alignment/{name}-shifts", f"Alignment/{name.upper()}-Shifts")
+                if held.file.exists(s)
+            ),
+            None,
         )
         if stream is not None:
             shifts[axis] = held.numbers(stream, "<f4", count).astype(np.float64)

@@ -1,11 +1,12 @@
 """Figures of merit: CNR, the limit of the data, observer, resolution, noise.
 
-Reading order: ``placement`` and ``roi`` say where is measured, ``cnr`` is the paper's figure over realisations,
-``data_limit`` the best that any unbiased method can reach. ``intervals`` gives figures theirs (bootstrap,
-jackknife), ``control`` narrows them. (What they are for, the dose factor, is :mod:`recon.evaluate`.) ``observer`` asks
-whether the core is seen, ``resolution`` and ``noise_power`` how sharp and how noisy an image is, and
-``plaque_measures`` measures lumen, core and cap. ``residual_test`` asks whether a volume explains
-its data at all, ``half_split`` what noise and resolution a real scan has, without a truth.
+Reading order: ``placement`` and ``roi`` say where is measured, ``cnr`` is the paper's figure over
+realisations, ``data_limit`` the best that any unbiased method can reach. ``intervals`` gives
+figures theirs (bootstrap, jackknife), ``control`` narrows them. (What they are for, the dose
+factor, is :mod:`recon.evaluate`.) ``observer`` asks whether the core is seen, ``resolution`` and
+``noise_power`` how sharp and how noisy an image is, and ``plaque_measures`` measures lumen, core
+and cap. ``residual_test`` asks whether a volume explains its data at all, ``half_split`` what noise
+and resolution a real scan has, without a truth.
 """
 
 from torchpcct.metrics.cnr import cnr, cnr_from_moments, cnr_interval, cnr_range, sd_interval

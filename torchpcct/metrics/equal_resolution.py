@@ -1,26 +1,31 @@
-"""Noise of two methods at equal resolution, in the plane and along z, without a truth: the dose factor of noise.
+"""Noise of two methods at equal resolution, in the plane and along z, without a truth: the dose
+factor of noise.
 
-A blur buys low noise with resolution, in whatever direction. So the reference, a linear method that has smoothed
-nothing, is filtered until it shows what the method shows, and then its noise is compared with the method's. Given are
-two volumes by each, of two scans with independent noise (:mod:`torchpcct.metrics.half_split`).
+A blur buys low noise with resolution, in whatever direction. So the reference, a linear method that
+has smoothed nothing, is filtered until it shows what the method shows, and then its noise is
+compared with the method's. Given are two volumes by each, of two scans with independent noise
+(:mod:`torchpcct.metrics.half_split`).
 
-1. Where. The cosine transforms of the two reference volumes are correlated in cells of one radial frequency in the
-   plane and one frequency along z (the Fourier shell correlation, Rosenthal and Henderson, J. Mol. Biol. 333, 721,
-   2003). Only frequencies at which both show the same are looked at: elsewhere nobody can tell what of the object a
-   method keeps, and low noise proves nothing. An object that does not change along z shows nothing of a blur along z;
-   such a blur then changes neither of the two noises that are compared.
-2. How sharp. The transfer is exp(k - Σ aᵢ (sxⁱ + syⁱ) - Σ bᵢ szⁱ), i = 1, 2, 3, s = sin²(π f) with f in cycles per
-   voxel. (A Gaussian has a₁ alone, as long as it is wide.) It solves Σ J (M - T R) = 0 in which method and reference
-   are of different scans, so that noise drops out: neither low noise nor much of it makes a method sharper.
-3. How noisy. The reference's difference is filtered by that transfer, and its variance over that of the method's
-   difference is the factor. A linear filter of the reference gives 1, whatever the object and the noise.
+1. Where. The cosine transforms of the two reference volumes are correlated in cells of one radial
+   frequency in the plane and one frequency along z (the Fourier shell correlation, Rosenthal and
+   Henderson, J. Mol. Biol. 333, 721, 2003). Only frequencies at which both show the same are looked
+   at: elsewhere nobody can tell what of the object a method keeps, and low noise proves nothing. An
+   object that does not change along z shows nothing of a blur along z; such a blur then changes
+   neither of the two noises that are compared.
+2. How sharp. The transfer is exp(k - Σ aᵢ (sxⁱ + syⁱ) - Σ bᵢ szⁱ), i = 1, 2, 3, s = sin²(π f) with
+   f in cycles per voxel. (A Gaussian has a₁ alone, as long as it is wide.) It solves Σ J (M - T R)
+   = 0 in which method and reference are of different scans, so that noise drops out: neither low
+   noise nor much of it makes a method sharper.
+3. How noisy. The reference's difference is filtered by that transfer, and its variance over that of
+   the method's difference is the factor. A linear filter of the reference gives 1, whatever the
+   object and the noise.
 
-The reference must not alias noise either: on voxels coarser than the detector's cells FBP does, the more the sharper
-its kernel, and then every smoother method seems to save dose. Volumes do not tell; see
-:func:`recon.evaluate.evaluate_scans`.
+The reference must not alias noise either: on voxels coarser than the detector's cells FBP does, the
+more the sharper its kernel, and then every smoother method seems to save dose. Volumes do not tell;
+see :func:`recon.evaluate.evaluate_scans`.
 
-The interval is a jackknife over bricks of the volume, widened by twice what the factor changes where the
-borders of the volume count, and by what the match itself may be off.
+The interval is a jackknife over bricks of the volume, widened by twice what the factor changes
+where the borders of the volume count, and by what the match itself may be off.
 """
 
 from __future__ import annotations
@@ -43,24 +48,31 @@ __all__ = ["EqualNoise", "noise_at_equal_resolution"]
 Floats = NDArray[np.float64]
 
 _AGREE = 0.143
-"""Correlation at which two half volumes are as good as one volume of a correlation of 0.5 with the truth."""
+"""Correlation at which two half volumes are as good as one volume of a correlation of 0.5 with
+the truth."""
 _CHANCE = 5.0
 """Standard deviations of a correlation by chance beyond which it counts."""
 _RINGS = 0.15
 """Width of the cells over their frequency."""
 _ORDERS = 3
-_STEPS, _SETTLED, _DAMPED = 40, 1e-5, 0.03
-"""Steps at most; change of ln(factor) below which they end; share of the noise's own curvature that shortens them."""
+_STEPS = 40
+_SETTLED = 1e-5
+_DAMPED = 0.03
+"""Steps at most; change of ln(factor) below which they end; share of the noise's own curvature
+that shortens them."""
 _FAINT = 0.01
-"""Frequencies at which the reference has less of its largest noise power count less: no match there is of use."""
+"""Frequencies at which the reference has less of its largest noise power count less: no match
+there is of use."""
 _MOST = 160
-"""Voxels along an axis that are looked at: of larger volumes those about the middle of the region."""
+"""Voxels along an axis that are looked at: of larger volumes those about the middle of the
+region."""
 _BRICKS = 5
 """Along each axis of the plane, and along z if there are slices enough."""
 _LEAST = 8
 """Voxels: axes that are shorter are not cut into bricks, and have no border that is left out."""
 _BORDER = 16
-"""Voxels at each border that count less, a third of the axis at most: filters differ in how they continue a volume."""
+"""Voxels at each border that count less, a third of the axis at most: filters differ in how they
+continue a volume."""
 _ROUGH = "its transfer relative to the reference is no smooth function of the frequency"
 _MATCH = 0.01
 """Relative standard error of a factor by the match: of 1.00 for linear filters at most."""
@@ -75,8 +87,8 @@ class EqualNoise:
         noise_shared: the same at the frequencies that the reference's volumes agree on.
         noise_reference: of the reference there, as sharp as the method.
         dose_factor: the ratio of the last two variances, with its 95 % interval; NaN with ``why``.
-        f50_plane, f50_z: frequency at which half of the reference's signal is left, line pairs per mm; inf: it does not
-            fall so far as the object shows.
+        f50_plane, f50_z: frequency at which half of the reference's signal is left, line pairs per
+            mm; inf: it does not fall so far as the object shows.
         shown_plane, shown_z: up to where the object shows it, line pairs per mm.
         why: there is no factor; empty if there is one.
     """
@@ -96,37 +108,62 @@ class EqualNoise:
 def noise_at_equal_resolution(
     method: HalfSplit, reference: HalfSplit, spacing: Sequence[float], region: Any = None
 ) -> EqualNoise:
-    """Compare the noise of a method with that of the reference, filtered to the method's resolution.
+    """Compare the noise of a method with that of the reference, filtered to the method's
+    resolution.
 
     Args:
         method: its volumes ``(z, y, x)`` of two scans of one object.
-        reference: of the same scans by a linear method that has smoothed nothing: FBP, kernel "ram-lak".
+        reference: of the same scans by a linear method that has smoothed nothing: FBP, kernel
+            "ram-lak".
         spacing: of the voxels, ``(z, y, x)`` mm.
-        region: bool mask of the volume where noise is measured; resolution is that of all of it. None: everywhere.
+        region: bool mask of the volume where noise is measured; resolution is that of all of it.
+            None: everywhere.
 
     Raises:
-        ValueError: volumes of other shapes or too small; constant volumes, or two that are the same, of which nothing
-            can be said; a region of fewer than two voxels.
+        ValueError: volumes of other shapes or too small; constant volumes, or two that are the
+            same, of which nothing can be said; a region of fewer than two voxels.
     """
-    pairs = [[np.asarray(v.numpy(), dtype=np.float64) for v in (p.first, p.second)] for p in (method, reference)]
+    pairs = [
+        [np.asarray(v.numpy(), dtype=np.float64) for v in (p.first, p.second)]
+        for p in (method, reference)
+    ]
     shape = pairs[1][0].shape
-    if len(shape) != 3 or min(shape[1:]) < _LEAST or any(v.shape != shape for pair in pairs for v in pair):
+    if (
+        len(shape) != 3
+        or min(shape[1:]) < _LEAST
+        or any(v.shape != shape for pair in pairs for v in pair)
+    ):
         shapes = ", ".join(str(v.shape) for pair in pairs for v in pair)
-        raise ValueError(f"volumes (z, y, x) of one shape are needed, {_LEAST} voxels or more in y and x; got {shapes}")
+        raise ValueError(
+            f"volumes (z, y, x) of one shape are needed, {_LEAST} voxels or more in y and x; got "
+            f"{shapes}"
+        )
     for name, pair in zip(("method", "reference"), pairs, strict=True):
         if any(np.ptp(v) <= 1e-6 * np.abs(v).max() for v in pair):
-            raise ValueError(f"the {name} has a constant volume: it shows nothing, so nothing can be said of its noise")
+            raise ValueError(
+                f"the {name} has a constant volume: it shows nothing, so nothing can be said of "
+                "its noise"
+            )
         one, other = pair
         if np.array_equal(one, other):
-            raise ValueError(f"the {name} has two volumes that are the same: they must be of two scans, or two halves")
+            raise ValueError(
+                f"the {name} has two volumes that are the same: they must be of two scans, or two "
+                "halves"
+            )
     mask = np.ones(shape, bool) if region is None else np.asarray(region, bool)
     if mask.shape != shape or mask.sum() < 2:
-        raise ValueError(f"region must be a mask of the shape {shape} with two voxels or more, got {mask.shape}, "
-                         f"{int(mask.sum())} voxels")  # fmt: skip
+        raise ValueError(
+            f"region must be a mask of the shape {shape} with two voxels or more, got "
+            f"{mask.shape}, "
+            f"{int(mask.sum())} voxels"
+        )
     part = _part(mask)
     pairs = [[v[part] for v in pair] for pair in pairs]
     first, second = (list(pair) for pair in pairs)
-    matches = (_Match(first, second, tuple(float(s) for s in spacing), orders) for orders in range(_ORDERS, 0, -1))
+    matches = (
+        _Match(first, second, tuple(float(s) for s in spacing), orders)
+        for orders in range(_ORDERS, 0, -1)
+    )
     found = [next(matches).compared(mask[part])]
     while found[-1].why == _ROUGH and len(found) < _ORDERS:
         found.append(next(matches).compared(mask[part]))
@@ -149,13 +186,16 @@ class _Cells:
     def __init__(self, shape: tuple[int, ...]) -> None:
         z, y, x = (np.arange(n) / (2.0 * n) for n in shape)
         self.plane, self.along = np.hypot(y[:, None], x), z
-        rings, layers = (self._numbered(f, n) for f, n in ((self.plane, min(shape[1:])), (z, shape[0])))
+        rings, layers = (
+            self._numbered(f, n) for f, n in ((self.plane, min(shape[1:])), (z, shape[0]))
+        )
         self.rings, self.shape = int(rings.max()) + 1, (int(layers.max()) + 1, int(rings.max()) + 1)
         self._ring, self._layer = rings.ravel(), layers
 
     @staticmethod
     def _numbered(frequency: Floats, voxels: int) -> NDArray[np.int64]:
-        """Index of the cell: of one sample each where they are far apart, of a fixed relative width beyond."""
+        """Index of the cell: of one sample each where they are far apart, of a fixed relative
+        width beyond."""
         step, edges = 1.0 / (2 * voxels), [0.5 / (2 * voxels)]
         while edges[-1] < frequency.max():
             edges.append(edges[-1] + max(step, _RINGS * edges[-1]))
@@ -170,7 +210,9 @@ class _Cells:
 
     def spread(self, cells: Any) -> Any:
         """A value for every sample."""
-        return np.asarray(cells)[self._layer][:, self._ring].reshape(len(self._layer), *self.plane.shape)
+        return np.asarray(cells)[self._layer][:, self._ring].reshape(
+            len(self._layer), *self.plane.shape
+        )
 
 
 class _Match:
@@ -182,7 +224,9 @@ class _Match:
         orders: terms for each direction.
     """
 
-    def __init__(self, method: list[Floats], reference: list[Floats], spacing: tuple[float, ...], orders: int) -> None:
+    def __init__(
+        self, method: list[Floats], reference: list[Floats], spacing: tuple[float, ...], orders: int
+    ) -> None:
         self.spacing, self.method, self.orders = spacing, method, orders
         self.shape = shape = method[0].shape
         self.cells = _Cells(shape)
@@ -211,15 +255,17 @@ class _Match:
 
     def transfer(self, theta: Floats) -> Floats:
         """Of every sample of the cosine transform."""
-        exponent = sum((t * term for t, term in zip(theta, self._terms, strict=True)), np.zeros((1, 1, 1)))
+        exponent = sum(
+            (t * term for t, term in zip(theta, self._terms, strict=True)), np.zeros((1, 1, 1))
+        )
         return np.exp(np.clip(-exponent, -30.0, 3.0))
 
     def _inverse(self, hat: Floats) -> Floats:
         return fft.idctn(hat, norm="ortho")
 
     def _start(self) -> Floats | None:
-        """By what the method does with the reference's noise: of linear methods the transfer itself; None: at the
-        frequencies that the object shows the method keeps nothing."""
+        """By what the method does with the reference's noise: of linear methods the transfer
+        itself; None: at the frequencies that the object shows the method keeps nothing."""
         difference = fft.dctn(self.method[0] - self.method[1], norm="ortho")
         own = self._hats[0] - self._hats[1]
         number = self.cells.sums(self.shared.astype(np.float64))
@@ -239,18 +285,25 @@ class _Match:
         return theta
 
     def _equations(self, theta: Floats, weight: Floats) -> tuple[Floats, Floats, Floats]:
-        """Of Gauss and Newton, of every brick: ``(bricks, terms, terms)`` and ``(bricks, terms)``; and the first with
-        both factors of one scan, ``(terms, terms)``, which noise makes larger but never indefinite."""
+        """Of Gauss and Newton, of every brick: ``(bricks, terms, terms)`` and ``(bricks, terms)``;
+        and the first with both factors of one scan, ``(terms, terms)``, which noise makes larger
+        but never indefinite."""
         transfer = self.transfer(theta)
         misfits = [
-            self._inverse(self._white * (m - transfer * r)) for m, r in zip(self._sought, self._hats, strict=True)
+            self._inverse(self._white * (m - transfer * r))
+            for m, r in zip(self._sought, self._hats, strict=True)
         ]
-        slopes = [[self._inverse(-self._white * term * transfer * r) for term in self._terms] for r in self._hats]
+        slopes = [
+            [self._inverse(-self._white * term * transfer * r) for term in self._terms]
+            for r in self._hats
+        ]
         n = len(self._terms)
         left, right = np.zeros((self._brick.max() + 1, n, n)), np.zeros((self._brick.max() + 1, n))
         alone = np.zeros((n, n))
         for i in range(n):
-            right[:, i] = self._of_bricks(slopes[0][i] * misfits[1] + slopes[1][i] * misfits[0], weight) / 2
+            right[:, i] = (
+                self._of_bricks(slopes[0][i] * misfits[1] + slopes[1][i] * misfits[0], weight) / 2
+            )
             for j in range(i, n):
                 both = slopes[0][i] * slopes[1][j] + slopes[1][i] * slopes[0][j]
                 left[:, i, j] = left[:, j, i] = self._of_bricks(both, weight) / 2
@@ -263,7 +316,8 @@ class _Match:
         return np.asarray(found, dtype=np.float64)
 
     def _fitted(self, theta: Floats) -> tuple[Floats, Floats, Floats] | None:
-        """Parameters and the last equations; None: no transfer of this form explains what the method shows."""
+        """Parameters and the last equations; None: no transfer of this form explains what the
+        method shows."""
         self._sought = [fft.dctn(v, norm="ortho") for v in self.method]
         own = self._hats[0] - self._hats[1]
         for _ in range(_STEPS):
@@ -271,7 +325,8 @@ class _Match:
             step = _solved(left.sum(0) + _DAMPED * alone, right.sum(0))
             step *= min(1.0, 1.0 / max(np.abs(step).max(), 1e-300))
             before, after = (
-                float(np.square(self.shared * self.transfer(t) * own).sum()) for t in (theta, theta + step)
+                float(np.square(self.shared * self.transfer(t) * own).sum())
+                for t in (theta, theta + step)
             )
             theta = theta + step
             if abs(after - before) <= _SETTLED * before:
@@ -282,14 +337,23 @@ class _Match:
         """See :func:`noise_at_equal_resolution`."""
         difference = self.method[0] - self.method[1]
         noise = float(difference[mask].std() / math.sqrt(2.0))
-        shown = [float(np.max(f[at], initial=0.0)) / s for f, at, s in (
-            (np.broadcast_to(self.cells.plane, self.shape), self.shared, self.spacing[-1]),
-            (np.broadcast_to(self.cells.along[:, None, None], self.shape), self.shared, self.spacing[0]),
-        )]  # fmt: skip
+        shown = [
+            float(np.max(f[at], initial=0.0)) / s
+            for f, at, s in (
+                (np.broadcast_to(self.cells.plane, self.shape), self.shared, self.spacing[-1]),
+                (
+                    np.broadcast_to(self.cells.along[:, None, None], self.shape),
+                    self.shared,
+                    self.spacing[0],
+                ),
+            )
+        ]
 
         def without(why: str) -> EqualNoise:
             nothing = Estimate(math.nan, math.nan, math.nan)
-            return EqualNoise(noise, math.nan, math.nan, nothing, math.inf, math.inf, shown[0], shown[1], why)
+            return EqualNoise(
+                noise, math.nan, math.nan, nothing, math.inf, math.inf, shown[0], shown[1], why
+            )
 
         if not self.shared.any():
             return without("the two volumes of the reference have nothing in common but noise")
@@ -304,7 +368,10 @@ class _Match:
         own = self._hats[0] - self._hats[1]
         reference = self._inverse(self.shared * transfer * own)
         method = self._inverse(self.shared * fft.dctn(difference, norm="ortho"))
-        slopes = [-2.0 * reference * self._inverse(self.shared * term * transfer * own) for term in self._terms]
+        slopes = [
+            -2.0 * reference * self._inverse(self.shared * term * transfer * own)
+            for term in self._terms
+        ]
         weight = self._weight * mask
         above, below = (self._of_bricks(v * v, weight) for v in (reference, method))
         if not below.sum() > 0:
@@ -315,7 +382,10 @@ class _Match:
         for k in np.flatnonzero(self._of_bricks(np.ones(self.shape), weight) > 0):
             change = _solved(left.sum(0) - left[k], right.sum(0) - right[k])
             up, down = above.sum() - above[k], below.sum() - below[k]
-            rest.append(math.log(max(up, 1e-300) / max(down, 1e-300)) + float((slope.sum(0) - slope[k]) @ change) / up)
+            rest.append(
+                math.log(max(up, 1e-300) / max(down, 1e-300))
+                + float((slope.sum(0) - slope[k]) @ change) / up
+            )
         if len(rest) < 3:
             return without("the region is too small to tell how certain its noise is")
         borders = np.ones(self.shape)
@@ -331,9 +401,15 @@ class _Match:
         one = float(weight.sum()) * 2.0
         sharp = [self._f50(theta, axis, limit) for axis, limit in zip((2, 0), shown, strict=True)]
         return EqualNoise(
-            noise, math.sqrt(below.sum() / one), math.sqrt(above.sum() / one), factor, sharp[0], sharp[1], shown[0],
+            noise,
+            math.sqrt(below.sum() / one),
+            math.sqrt(above.sum() / one),
+            factor,
+            sharp[0],
+            sharp[1],
+            shown[0],
             shown[1],
-        )  # fmt: skip
+        )
 
     def _f50(self, theta: Floats, axis: int, limit: float) -> float:
         """Along an axis; the factor k is no matter of sharpness."""
@@ -351,7 +427,9 @@ class _Match:
 def _solved(left: Floats, right: Floats) -> Floats:
     """Least squares of the normal equations; what they do not determine stays as it is."""
     scale = np.sqrt(np.maximum(np.abs(np.diag(left)), 1e-300))
-    found: Floats = np.linalg.lstsq(left / np.outer(scale, scale), right / scale, rcond=1e-7)[0] / scale
+    found: Floats = (
+        np.linalg.lstsq(left / np.outer(scale, scale), right / scale, rcond=1e-7)[0] / scale
+    )
     return found
 
 

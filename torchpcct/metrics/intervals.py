@@ -1,9 +1,9 @@
 """Intervals of figures over paired realisations: bootstrap and jackknife.
 
-All methods see the same noise seeds. So one set of resampling indices serves everything that shares them; and what
-methods have in common cancels in a ratio or a difference only if the figures are left without the same realisation
-together. A :class:`Jackknifed` carries its replicates along, and any smooth function of several has its interval for
-free.
+All methods see the same noise seeds. So one set of resampling indices serves everything that shares
+them; and what methods have in common cancels in a ratio or a difference only if the figures are
+left without the same realisation together. A :class:`Jackknifed` carries its replicates along, and
+any smooth function of several has its interval for free.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ def generator(seed: int) -> np.random.Generator:
 
 
 def resampling(realizations: int, draws: int, seed: int) -> NDArray[np.int64]:
-    """``(draws, realizations)`` indices with replacement. The same arguments give the same indices: paired."""
+    """``(draws, realizations)`` indices with replacement. The same arguments give the same
+    indices: paired."""
     return generator(seed).integers(0, realizations, (draws, realizations))
 
 
@@ -58,11 +59,13 @@ def leave_one_out(realizations: int) -> NDArray[np.int64]:
     return index + (index >= np.arange(realizations)[:, None])
 
 
-def bca_interval(value: float, draws: Any, jackknife: Any, level: float = 0.95) -> tuple[float, float]:
+def bca_interval(
+    value: float, draws: Any, jackknife: Any, level: float = 0.95
+) -> tuple[float, float]:
     """Bias-corrected and accelerated bootstrap interval (Efron 1987).
 
-    A variance from few realisations is skewed: the plain percentile interval lies too low. Order statistics are not
-    interpolated, so draws may be 0 or Inf (a dose beyond the curve's range).
+    A variance from few realisations is skewed: the plain percentile interval lies too low. Order
+    statistics are not interpolated, so draws may be 0 or Inf (a dose beyond the curve's range).
 
     Args:
         value: the figure of all realisations.
@@ -96,8 +99,8 @@ class Jackknifed:
 
     Attributes:
         value: of all realisations.
-        left_out: ``(n,)``, each realisation left out once; realisation k has the same noise seed in every figure that
-            this one is combined with.
+        left_out: ``(n,)``, each realisation left out once; realisation k has the same noise seed in
+            every figure that this one is combined with.
     """
 
     value: float
@@ -116,7 +119,8 @@ class Jackknifed:
         return Estimate(self.value, self.value - half, self.value + half)
 
     def exponential(self, level: float = 0.95, scale: float = 1.0) -> Estimate:
-        """exp(scale · figure) with the interval of the figure: for logarithms of a variance (½: the SD)."""
+        """exp(scale · figure) with the interval of the figure: for logarithms of a variance (½:
+        the SD)."""
         value, *ends = (math.exp(scale * v) for v in self.estimate(level))
         return Estimate(value, *sorted(ends))
 
@@ -130,16 +134,21 @@ def combined(function: Callable[..., Any], *figures: Jackknifed | float) -> Jack
         figures: at least one :class:`Jackknifed`.
 
     Raises:
-        ValueError: figures of different numbers of realisations, or none of a sample; a value that is not finite.
+        ValueError: figures of different numbers of realisations, or none of a sample; a value that
+            is not finite.
     """
     sizes = {f.left_out.size for f in figures if isinstance(f, Jackknifed)}
     if len(sizes) != 1:
-        raise ValueError(f"figures must be of the same realisations, got numbers of realisations {sorted(sizes)}")
+        raise ValueError(
+            f"figures must be of the same realisations, got numbers of realisations {sorted(sizes)}"
+        )
     value = float(function(*[f.value if isinstance(f, Jackknifed) else f for f in figures]))
     left_out = function(*[f.left_out if isinstance(f, Jackknifed) else f for f in figures])
     left_out = np.broadcast_to(np.asarray(left_out, dtype=np.float64), (sizes.pop(),))
     if not (math.isfinite(value) and np.isfinite(left_out).all()):
-        raise ValueError(f"the combined figure is not finite ({value}): check its arguments (a logarithm of 0?)")
+        raise ValueError(
+            f"the combined figure is not finite ({value}): check its arguments (a logarithm of 0?)"
+        )
     return Jackknifed(value, left_out)
 
 
@@ -148,8 +157,8 @@ def log_of_sum(parts: Any, lost: int = 0) -> Jackknifed:
 
     Args:
         parts: ``(n,)``.
-        lost: 0 for a mean. 1 for squared deviations from the mean of the realisations, where the sum without one loses
-            n / (n − 1) of its part.
+        lost: 0 for a mean. 1 for squared deviations from the mean of the realisations, where the
+            sum without one loses n / (n − 1) of its part.
 
     Raises:
         ValueError: fewer than 3 realisations; nothing varies.

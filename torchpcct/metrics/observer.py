@@ -1,12 +1,13 @@
-"""Channelised Hotelling observer: is the core there? A task figure that contrast shrinkage cannot improve.
+"""Channelised Hotelling observer: is the core there? A task figure that contrast shrinkage cannot
+improve.
 
-Each image is reduced to its responses to a few channels centred at the known place of the core; the observer is the
-best linear combination of them, ``w = K⁻¹ (v̄₁ − v̄₀)`` with the mean covariance K of both classes. Present and absent
-images with the same noise seed form a PAIR: they are left out together when the observer is trained, and by the
-jackknife that gives the interval of d′.
+Each image is reduced to its responses to a few channels centred at the known place of the core; the
+observer is the best linear combination of them, ``w = K⁻¹ (v̄₁ − v̄₀)`` with the mean covariance K
+of both classes. Present and absent images with the same noise seed form a PAIR: they are left out
+together when the observer is trained, and by the jackknife that gives the interval of d′.
 
-Channels: dense difference of Gaussians (Abbey and Barrett, J. Opt. Soc. Am. A 18, 473 (2001)), radial in mm, so that
-they serve a plane or a volume of any spacing.
+Channels: dense difference of Gaussians (Abbey and Barrett, J. Opt. Soc. Am. A 18, 473 (2001)),
+radial in mm, so that they serve a plane or a volume of any spacing.
 """
 
 from __future__ import annotations
@@ -33,28 +34,35 @@ __all__ = [
 ]
 
 Floats = NDArray[np.float64]
-_RATIO, _WIDTH = 1.4, 1.67
+_RATIO = 1.4
+_WIDTH = 1.67
 
 
 @checked
-def dog_channels(grid: VolumeGrid, center: tuple[float, ...], count: int = 10, lowest: float | None = None) -> Floats:
-    """Dense difference-of-Gaussians channels: ``exp(−f² / 2 (Q s_j)²) − exp(−f² / 2 s_j²)``, ``s_j = s₀ αʲ``, with the
-    source's α = 1.4 and Q = 1.67.
+def dog_channels(
+    grid: VolumeGrid, center: tuple[float, ...], count: int = 10, lowest: float | None = None
+) -> Floats:
+    """Dense difference-of-Gaussians channels: ``exp(−f² / 2 (Q s_j)²) − exp(−f² / 2 s_j²)``, ``s_j
+    = s₀ αʲ``, with the source's α = 1.4 and Q = 1.67.
 
     Args:
         grid: ``(y, x)`` axial plane or ``(z, y, x)`` volume.
         center: of the channels in mm, in the order of the grid's axes (the core's known place).
         count: channels.
-        lowest: s₀ in cycles per mm; None: 0.005 cycles per voxel of the finest axis, as in the source.
+        lowest: s₀ in cycles per mm; None: 0.005 cycles per voxel of the finest axis, as in the
+            source.
 
     Returns:
         ``(count, *grid.shape)`` float64, each of unit norm.
 
     Raises:
-        ValueError: a centre of other axes than the grid, a count < 1, a frequency that is not positive.
+        ValueError: a centre of other axes than the grid, a count < 1, a frequency that is not
+            positive.
     """
     if len(center) != grid.ndim:
-        raise ValueError(f"center must have {grid.ndim} numbers in mm, one per axis of the grid, got {center!r}")
+        raise ValueError(
+            f"center must have {grid.ndim} numbers in mm, one per axis of the grid, got {center!r}"
+        )
     s0 = 0.005 / min(grid.spacing) if lowest is None else float(lowest)
     if count < 1 or not s0 > 0:
         raise ValueError(f"need count ≥ 1 and lowest > 0, got {count} and {s0}")
@@ -67,13 +75,18 @@ def dog_channels(grid: VolumeGrid, center: tuple[float, ...], count: int = 10, l
     def gaussian(s: float) -> Floats:
         return s**grid.ndim * np.exp(-2.0 * (math.pi * s) ** 2 * squares)
 
-    channels = np.stack([gaussian(_WIDTH * s) - gaussian(s) for s in s0 * _RATIO ** np.arange(count)])
-    return channels / np.sqrt(np.square(channels).sum(tuple(range(1, channels.ndim)), keepdims=True))
+    channels = np.stack(
+        [gaussian(_WIDTH * s) - gaussian(s) for s in s0 * _RATIO ** np.arange(count)]
+    )
+    return channels / np.sqrt(
+        np.square(channels).sum(tuple(range(1, channels.ndim)), keepdims=True)
+    )
 
 
 @checked
 def template_channel(expected_difference: ArrayLike) -> Floats:
-    """The known signal itself as a channel, ``(1, ...)`` of unit norm: to be stacked with the others.
+    """The known signal itself as a channel, ``(1, ...)`` of unit norm: to be stacked with the
+    others.
 
     Args:
         expected_difference: mean image with the core minus mean image without it.
@@ -97,7 +110,9 @@ def channel_responses(images: ArrayLike, channels: ArrayLike) -> Floats:
     """
     x, c = as_array(images), as_array(channels)
     if x.ndim < 2 or x.shape[1:] != c.shape[1:]:
-        raise ValueError(f"images (n, ...) and channels (c, ...) must match, got {x.shape} and {c.shape}")
+        raise ValueError(
+            f"images (n, ...) and channels (c, ...) must match, got {x.shape} and {c.shape}"
+        )
     flat = c.reshape(c.shape[0], -1).astype(np.float64)
     responses = np.stack([flat @ image.reshape(-1).astype(np.float64) for image in x])
     if not np.isfinite(responses).all():
@@ -107,25 +122,32 @@ def channel_responses(images: ArrayLike, channels: ArrayLike) -> Floats:
 
 @checked
 def hotelling_scores(present: ArrayLike, absent: ArrayLike) -> tuple[Floats, Floats]:
-    """Decision variables of the Hotelling observer, each pair scored by an observer trained on all others.
+    """Decision variables of the Hotelling observer, each pair scored by an observer trained on all
+    others.
 
     Args:
         present, absent: ``(n, channels)`` responses; pair k has one noise seed.
 
     Returns:
-        scores of present and absent, ``(n,)`` each, scaled to the observer's own d′ units: the expected difference of a
-        trained observer is its d′².
+        scores of present and absent, ``(n,)`` each, scaled to the observer's own d′ units: the
+        expected difference of a trained observer is its d′².
 
     Raises:
-        ValueError: wrong shapes, too few training pairs for the channels, channels that are linearly dependent.
+        ValueError: wrong shapes, too few training pairs for the channels, channels that are
+            linearly dependent.
     """
     a, b = np.asarray(present, dtype=np.float64), np.asarray(absent, dtype=np.float64)
     if a.ndim != 2 or a.shape != b.shape:
-        raise ValueError(f"present and absent must be (n, channels) pairs, got {a.shape} and {b.shape}")
+        raise ValueError(
+            f"present and absent must be (n, channels) pairs, got {a.shape} and {b.shape}"
+        )
     n, c = a.shape
     used = n - 1
     if used <= c:
-        raise ValueError(f"{used} training pairs are too few for {c} channels: use at least {c + 1}, or fewer channels")
+        raise ValueError(
+            f"{used} training pairs are too few for {c} channels: use at least {c + 1}, or fewer "
+            "channels"
+        )
     da, db = a - a.mean(0), b - b.mean(0)
     own = [d[:, :, None] * d[:, None] for d in (da, db)]
     # About the mean of the others the scatter is S − n / (n − 1) d dᵀ.
@@ -158,9 +180,13 @@ def d_prime(present: ArrayLike, absent: ArrayLike) -> Jackknifed:
     Raises:
         ValueError: fewer than 5 pairs, unequal numbers, NaN or Inf, scores that do not vary.
     """
-    means, variances = ([find(s, None, None) for s in (present, absent)] for find in
-                        (controlled_mean, controlled_log_variance))  # fmt: skip
-    return combined(lambda a, b, v, w: (a - b) / np.sqrt((np.exp(v) + np.exp(w)) / 2.0), *means, *variances)
+    means, variances = (
+        [find(s, None, None) for s in (present, absent)]
+        for find in (controlled_mean, controlled_log_variance)
+    )
+    return combined(
+        lambda a, b, v, w: (a - b) / np.sqrt((np.exp(v) + np.exp(w)) / 2.0), *means, *variances
+    )
 
 
 @checked

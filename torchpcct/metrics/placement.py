@@ -1,9 +1,11 @@
-"""Where the two ROIs of the paper's CNR go: by tissue and distance, so that they follow any variant of the plaque.
+"""Where the two ROIs of the paper's CNR go: by tissue and distance, so that they follow any variant
+of the plaque.
 
-The paper shows its ROIs only in a figure: the foreground lies inside the necrotic core, the background in the fibrous
-tissue next to the core, both fully inside their tissue on the noise-free 0.1 mm image (means 40.1 and 91.8 HU). The
-distances below are our choice; they are printed with every CNR because the number hinges on them. The background is ONE
-connected region: in the paper's table its SD is 1.7 to 2.3 times that of the core, so it must be the smaller one.
+The paper shows its ROIs only in a figure: the foreground lies inside the necrotic core, the
+background in the fibrous tissue next to the core, both fully inside their tissue on the noise-free
+0.1 mm image (means 40.1 and 91.8 HU). The distances below are our choice; they are printed with
+every CNR because the number hinges on them. The background is ONE connected region: in the paper's
+table its SD is 1.7 to 2.3 times that of the core, so it must be the smaller one.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ class RoiRule:
         core_margin: the foreground keeps this far from the core's edge.
         background_margin: the background keeps this far from every edge of the fibrous tissue.
         background_reach: the background ends this far from the core.
-        lumen_margin: the background keeps this far from the lumen, whose blood (500 HU) would spill into it.
+        lumen_margin: the background keeps this far from the lumen, whose blood (500 HU) would spill
+            into it.
     """
 
     core_margin: float = 0.20
@@ -50,7 +53,9 @@ class RoiPair:
 
     def on(self, grid: VolumeGrid) -> tuple[RoiMean, RoiMean]:
         """The two ROI means as functionals of volumes on ``grid``."""
-        return RoiMean(grid, self.image, self.foreground), RoiMean(grid, self.image, self.background)
+        return RoiMean(grid, self.image, self.foreground), RoiMean(
+            grid, self.image, self.background
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Sizes of the ROIs for the report."""
@@ -70,7 +75,8 @@ def place_rois(scene: Scene, image: VolumeGrid, rule: RoiRule | None = None) -> 
     """Place the paper's ROIs on an axial image of a scene.
 
     Args:
-        scene: its bodies ``"core"``, ``"fibrous"`` and ``"lumen"`` mark where the ROIs go, whatever fills them.
+        scene: its bodies ``"core"``, ``"fibrous"`` and ``"lumen"`` mark where the ROIs go, whatever
+            fills them.
         image: axial image grid, e.g. :func:`torchpcct.metrics.roi.axial_grid`.
         rule: distances; None: the defaults.
 
@@ -85,9 +91,11 @@ def place_rois(scene: Scene, image: VolumeGrid, rule: RoiRule | None = None) -> 
 
 @checked
 def whole_rois(scene: Scene, image: VolumeGrid) -> RoiPair:
-    """All of the core and all of the tissue in an image of one or more slices, but for a margin at their edges.
+    """All of the core and all of the tissue in an image of one or more slices, but for a margin at
+    their edges.
 
-    The paper's two ROIs ask for a contrast in one small place; these ask how different the two tissues are.
+    The paper's two ROIs ask for a contrast in one small place; these ask how different the two
+    tissues are.
 
     Args:
         scene: as for :func:`place_rois`.
@@ -115,7 +123,10 @@ def _placed(scene: Scene, image: VolumeGrid, rule: RoiRule) -> RoiPair:
         ("background", background, rule.background_margin),
     ):
         if not mask.any():
-            raise ValueError(f"the {name} ROI is empty: its margin of {margin} mm is wider than the tissue; reduce it")
+            raise ValueError(
+                f"the {name} ROI is empty: its margin of {margin} mm is wider than the tissue; "
+                "reduce it"
+            )
     return RoiPair(foreground, background, image, rule)
 
 

@@ -1,18 +1,21 @@
-"""What is measured on a plaque's axial image: by contours at a threshold, by segmentation, on a line.
+"""What is measured on a plaque's axial image: by contours at a threshold, by segmentation, on a
+line.
 
-By contours, :func:`lumen_area` finds the closed contour around a point that is known to lie in the lumen, to a fraction
-of a voxel; it needs no protocol and no fat around the vessel.
+By contours, :func:`lumen_area` finds the closed contour around a point that is known to lie in the
+lumen, to a fraction of a voxel; it needs no protocol and no fat around the vessel.
 
-By segmentation, :func:`segment_plaque` follows the protocol of Li et al. (section "Image Resolution"): on the axial
-image of 0.035 mm pixels the lumen is what reads at least 250 HU (half of the contrast-enhanced blood), the necrotic
-core what reads 20 to 60 HU (half to one and a half times its value); the lumen's area is its number of pixels, the
-cap's thickness the smallest distance between the two.
+By segmentation, :func:`segment_plaque` follows the protocol of Li et al. (section "Image
+Resolution"): on the axial image of 0.035 mm pixels the lumen is what reads at least 250 HU (half of
+the contrast-enhanced blood), the necrotic core what reads 20 to 60 HU (half to one and a half times
+its value); the lumen's area is its number of pixels, the cap's thickness the smallest distance
+between the two.
 
-A band of CT numbers selects more than the core: every edge between bright tissue and fat passes through it, and so
-does the vessel's wall. All of that is connected to the fat around the vessel. The core is therefore the part of the
-band that tissue brighter than the band ENCLOSES in the image ("well identified and separated from the vessel media",
-as the paper puts it); once blur or noise opens a way out, there is no core to measure, and its measures are NaN.
-On the line from the lumen to the core, :func:`cap_on_line` still reads what is left of the cap.
+A band of CT numbers selects more than the core: every edge between bright tissue and fat passes
+through it, and so does the vessel's wall. All of that is connected to the fat around the vessel.
+The core is therefore the part of the band that tissue brighter than the band ENCLOSES in the image
+("well identified and separated from the vessel media", as the paper puts it); once blur or noise
+opens a way out, there is no core to measure, and its measures are NaN. On the line from the lumen
+to the core, :func:`cap_on_line` still reads what is left of the cap.
 """
 
 from __future__ import annotations
@@ -56,13 +59,17 @@ _STEP_MM = 0.005
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
-# Dark regions join at edges only, bright ones at corners too: a closed diagonal line of cap separates.
+# Dark regions join at edges only, bright ones at corners too: a closed diagonal line of cap
+# separates.
 _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], dtype=bool)
 
 
 @checked
-def lumen_area(image: ArrayLike, grid: VolumeGrid, seed: tuple[float, float], threshold: float = LUMEN_HU) -> float:
-    """Area in mm² inside the contour at a threshold around a point, by marching squares with linear interpolation.
+def lumen_area(
+    image: ArrayLike, grid: VolumeGrid, seed: tuple[float, float], threshold: float = LUMEN_HU
+) -> float:
+    """Area in mm² inside the contour at a threshold around a point, by marching squares with linear
+    interpolation.
 
     Args:
         image: ``(y, x)`` or ``(1, y, x)`` HU, tensor or array.
@@ -71,14 +78,19 @@ def lumen_area(image: ArrayLike, grid: VolumeGrid, seed: tuple[float, float], th
         threshold: HU.
 
     Returns:
-        NaN where no closed contour surrounds the seed (the lumen is lost, or merged with the image's border).
+        NaN where no closed contour surrounds the seed (the lumen is lost, or merged with the
+        image's border).
 
     Raises:
         ValueError: an image that is not one slice of the grid's shape, NaN or Inf.
     """
     x, plane = _slice(image, grid)
     origin = np.array([a[0] for a in plane.axes])
-    closed = (origin + c * plane.spacing for c in find_contours(x, threshold) if np.array_equal(c[0], c[-1]))
+    closed = (
+        origin + c * plane.spacing
+        for c in find_contours(x, threshold)
+        if np.array_equal(c[0], c[-1])
+    )
     return min((_area(c) for c in closed if points_in_poly([seed], c)[0]), default=math.nan)
 
 
@@ -123,8 +135,9 @@ class PlaqueSegmentation:
     def cap_thickness(self) -> float:
         """Smallest distance in mm between lumen and core, NaN where either is lost.
 
-        Between the contours at the lumen's threshold and at the core's upper limit, with linear interpolation between
-        pixels: whole pixels would quantise a cap of 0.17 mm in steps of a fifth.
+        Between the contours at the lumen's threshold and at the core's upper limit, with linear
+        interpolation between pixels: whole pixels would quantise a cap of 0.17 mm in steps of a
+        fifth.
         """
         if not self.lumen.any() or not self.core.any():
             return math.nan
@@ -166,17 +179,20 @@ def segment_plaque(image: ArrayLike, grid: VolumeGrid) -> PlaqueSegmentation:
 
 
 @checked
-def cap_on_line(image: ArrayLike, grid: VolumeGrid, start: tuple[float, float], end: tuple[float, float]) -> float:
-    """Cap thickness in mm on the line from the lumen to the core: where the image falls below both thresholds.
+def cap_on_line(
+    image: ArrayLike, grid: VolumeGrid, start: tuple[float, float], end: tuple[float, float]
+) -> float:
+    """Cap thickness in mm on the line from the lumen to the core: where the image falls below both
+    thresholds.
 
-    Unlike :attr:`PlaqueSegmentation.cap_thickness` it needs no closed core: it still reads what blur makes of the cap
-    where the core has joined the wall.
+    Unlike :attr:`PlaqueSegmentation.cap_thickness` it needs no closed core: it still reads what
+    blur makes of the cap where the core has joined the wall.
 
     Args:
         image, grid: as for :func:`segment_plaque`.
-        start, end: ``(y, x)`` mm, in the lumen and in the core (their centres). The lumen ends where the image first
-            falls below its threshold, the core begins where it first falls to its upper one, by linear interpolation
-            between samples 5 µm apart.
+        start, end: ``(y, x)`` mm, in the lumen and in the core (their centres). The lumen ends
+            where the image first falls below its threshold, the core begins where it first falls to
+            its upper one, by linear interpolation between samples 5 µm apart.
 
     Returns:
         NaN where the line does not start in the lumen, or does not reach the core.
@@ -191,9 +207,14 @@ def cap_on_line(image: ArrayLike, grid: VolumeGrid, start: tuple[float, float], 
         raise ValueError(f"start and end must lie apart, got a line of {length:g} mm")
     along = np.linspace(0.0, length, math.ceil(length / _STEP_MM) + 1)
     points = a[:, None] + (b - a)[:, None] * along / length
-    index = (points - np.array([v[0] for v in plane.axes])[:, None]) / np.array(plane.spacing)[:, None]
+    index = (points - np.array([v[0] for v in plane.axes])[:, None]) / np.array(plane.spacing)[
+        :, None
+    ]
     if index.min() < 0 or (index.max(axis=1) > np.array(plane.shape) - 1).any():
-        raise ValueError(f"the line from {tuple(start)} to {tuple(end)} mm leaves the image: give points inside it")
+        raise ValueError(
+            f"the line from {tuple(start)} to {tuple(end)} mm leaves the image: give points "
+            "inside it"
+        )
     profile = map_coordinates(x, index, order=1)
     edges = [first_below(along, profile, level, math.nan) for level in (LUMEN_HU, CORE_HU[1])]
     return edges[1] - edges[0] if profile[0] >= LUMEN_HU else math.nan
@@ -201,10 +222,12 @@ def cap_on_line(image: ArrayLike, grid: VolumeGrid, start: tuple[float, float], 
 
 @checked
 def basin_depth(image: ArrayLike, grid: VolumeGrid, within: ArrayLike) -> float:
-    """Depth in HU of the deepest basin in a region: from its bottom to the lowest pass that leads to the border.
+    """Depth in HU of the deepest basin in a region: from its bottom to the lowest pass that leads
+    to the border.
 
-    What remains of a dark core's boundary, whatever its absolute CT numbers: 0 where the image falls from the core all
-    the way to the fat, so that no contour of any level closes around the core.
+    What remains of a dark core's boundary, whatever its absolute CT numbers: 0 where the image
+    falls from the core all the way to the fat, so that no contour of any level closes around the
+    core.
 
     Args:
         image, grid: as for :func:`segment_plaque`.
@@ -216,7 +239,10 @@ def basin_depth(image: ArrayLike, grid: VolumeGrid, within: ArrayLike) -> float:
     x, _ = _slice(image, grid)
     region = np.asarray(within, dtype=bool)
     if region.shape != x.shape or not region.any():
-        raise ValueError(f"within must mark pixels of an image of shape {x.shape}, got {region.shape}, {region.sum()}")
+        raise ValueError(
+            f"within must mark pixels of an image of shape {x.shape}, got {region.shape}, "
+            f"{region.sum()}"
+        )
     lake = x.copy()
     lake[1:-1, 1:-1] = x.max()
     return float((reconstruction(lake, x, method="erosion", footprint=_CROSS) - x)[region].max())

@@ -1,14 +1,16 @@
-"""Does a volume explain its data? Tests of the residual y − A x that know their own rate of false alarms.
+"""Does a volume explain its data? Tests of the residual y − A x that know their own rate of false
+alarms.
 
-χ² per reading alone sees little: an error of the rotation centre by half a column moves an image by 25 HU and χ² by a
-few per cent. What an error of the scanner does to the readings is known, however, up to its size. The score test
-(Rao 1948) of one cause projects the residual onto that pattern t,
+χ² per reading alone sees little: an error of the rotation centre by half a column moves an image by
+25 HU and χ² by a few per cent. What an error of the scanner does to the readings is known, however,
+up to its size. The score test (Rao 1948) of one cause projects the residual onto that pattern t,
 
     s = ⟨t, W r⟩ / √⟨t, W t⟩,
 
-which is normal with variance 1 if only noise is left; several patterns of one cause are tested together by their χ².
-What the reconstruction has taken up of the pattern makes s smaller, never larger, so the rate of false alarms stays
-below the stated one. Blur by a prior is symmetric about an edge, and does not look like a shift.
+which is normal with variance 1 if only noise is left; several patterns of one cause are tested
+together by their χ². What the reconstruction has taken up of the pattern makes s smaller, never
+larger, so the rate of false alarms stays below the stated one. Blur by a prior is symmetric about
+an edge, and does not look like a shift.
 """
 
 from __future__ import annotations
@@ -28,15 +30,19 @@ __all__ = ["FALSE_ALARMS", "ResidualTest", "residual_test"]
 FALSE_ALARMS = 0.005
 """Share of faultless scans for which any of the tests raises an alarm."""
 MISFIT = 0.03
-"""Part of χ² that voxels and prior may add or take away without being an error: discretisation and blur of edges that
-the data see; 1 % on the paper's plaque."""
+"""Part of χ² that voxels and prior may add or take away without being an error: discretisation and
+blur of edges that the data see; 1 % on the paper's plaque."""
 GAIN_TOLERANCE = 0.001
-"""Gain error (rms over views or rows) that a sound scan may have: calibration, and what voxels cannot show."""
+"""Gain error (rms over views or rows) that a sound scan may have: calibration, and what voxels
+cannot show."""
 CENTRE_TOLERANCE = 0.05
-"""Columns beside their place that are no finding: noise in millions of readings tells a hundredth, which voxels and
-interpolation leave. A reconstruction takes most of an error up: a column off leaves the more."""
-_DENSE, _DENSE_SHARE = 0.8, 2.0
-"""The densest fifth of the rays, and how many times more they must lie off than the others for beam hardening."""
+"""Columns beside their place that are no finding: noise in millions of readings tells a hundredth,
+which voxels and interpolation leave. A reconstruction takes most of an error up: a column off
+leaves the more."""
+_DENSE = 0.8
+_DENSE_SHARE = 2.0
+"""The densest fifth of the rays, and how many times more they must lie off than the others for
+beam hardening."""
 _HARMONICS = 3
 _LARGE = 1e5
 """Mean from which on the tails of χ² are those of a transformed normal."""
@@ -61,7 +67,12 @@ class ResidualTest:
 
 @checked
 def residual_test(
-    residual: Tensor, weights: Tensor, fitted: Tensor, *, unknowns: int = 0, false_alarms: float = FALSE_ALARMS
+    residual: Tensor,
+    weights: Tensor,
+    fitted: Tensor,
+    *,
+    unknowns: int = 0,
+    false_alarms: float = FALSE_ALARMS,
 ) -> ResidualTest:
     """Test what a reconstruction has left of its data.
 
@@ -73,12 +84,12 @@ def residual_test(
         false_alarms: share of faultless scans with any finding, shared among the tests.
 
     Returns:
-        The tests ``level`` (χ² itself), ``centre`` (a shift of the columns), ``views`` (gain from view to view and its
-        slow drift over the scan), ``rows`` (gain from row to row).
+        The tests ``level`` (χ² itself), ``centre`` (a shift of the columns), ``views`` (gain from
+        view to view and its slow drift over the scan), ``rows`` (gain from row to row).
 
     Raises:
-        ValueError: shapes that differ or have not three axes, negative weights or none at all, NaN or Inf where the
-            weight is not 0, a rate outside (0, 1).
+        ValueError: shapes that differ or have not three axes, negative weights or none at all, NaN
+            or Inf where the weight is not 0, a rate outside (0, 1).
     """
     coverage("false_alarms", false_alarms)
     number("unknowns", unknowns, low=0)
@@ -90,7 +101,9 @@ def residual_test(
     w = weights.double()
     count = int((w > 0).sum())
     if not bool((w >= 0).all()) or count == 0:
-        raise ValueError("weights must be 0 or more, and some greater than 0: give inverse variances")
+        raise ValueError(
+            "weights must be 0 or more, and some greater than 0: give inverse variances"
+        )
     r, lines = (torch.where(w > 0, v.double(), 0.0) for v in (residual, fitted))
     if not bool(torch.isfinite(r).all() and torch.isfinite(lines).all()):
         raise ValueError("residual and fitted must be finite where the weight is not 0")
@@ -99,15 +112,18 @@ def residual_test(
     level = false_alarms / 4.0
     p_values, sizes, findings = {}, {}, []
 
-    # χ²: too low only if the noise is less than stated, by more than what the unknowns have taken up.
+    # χ²: too low only if the noise is less than stated, by more than what the unknowns have taken
+    # up.
     spread = math.sqrt(2.0 / count)
     above = (chi2 - 1.0 - MISFIT) / spread
     below = (1.0 - MISFIT - min(unknowns / count, 1.0) - chi2) / spread
     p_values["level"] = float(min(1.0, 2.0 * stats.norm.sf(max(above, below))))
     if p_values["level"] < level:
         findings.append(
-            f"the data differ from the volume by {chi2:.4g} times their stated noise variance (1 ± {spread:.2g} "
-            "expected): exposure, geometry or surround are not those of the scan, or something outside of the grid was "
+            f"the data differ from the volume by {chi2:.4g} times their stated noise variance (1 "
+            f"± {spread:.2g} "
+            "expected): exposure, geometry or surround are not those of the scan, or something "
+            "outside of the grid was "
             "left out"
         )
 
@@ -116,18 +132,24 @@ def residual_test(
     power = float((w * shifted.square()).sum())
     if power > 0.0:
         score = float((shifted * wr).sum()) / math.sqrt(power)
-        p_values["centre"], sizes["centre"] = float(2.0 * stats.norm.sf(abs(score))), score / math.sqrt(power)
+        p_values["centre"], sizes["centre"] = (
+            float(2.0 * stats.norm.sf(abs(score))),
+            score / math.sqrt(power),
+        )
         if p_values["centre"] < level and abs(sizes["centre"]) > CENTRE_TOLERANCE:
             findings.append(
-                f"the readings lie {abs(sizes['centre']):.2g} columns or more beside what the volume projects to "
-                f"({abs(score):.1f} standard deviations): the rotation centre (the detector's column offset) is wrong"
+                f"the readings lie {abs(sizes['centre']):.2g} columns or more beside what the "
+                "volume projects to "
+                f"({abs(score):.1f} standard deviations): the rotation centre (the detector's "
+                "column offset) is wrong"
             )
 
     for name, axes, parts in (("views", (1, 2), 2), ("rows", (0, 2), 1)):
         weight, total = w.sum(axes), wr.sum(axes)
         known = weight > 0
         scores = total[known] / weight[known].sqrt()
-        # Every view alone, and the slow drifts over all of them, which add up what single views cannot tell.
+        # Every view alone, and the slow drifts over all of them, which add up what single views
+        # cannot tell.
         tolerated = GAIN_TOLERANCE**2 * float(weight.sum())
         tails = [_upper_tail(float(scores.square().sum()), scores.numel(), tolerated)]
         if parts == 2 and scores.numel() > 4 * _HARMONICS:
@@ -136,7 +158,8 @@ def residual_test(
         if p_values[name] < level:
             size = float((total[known] / weight[known]).square().mean().sqrt())
             findings.append(
-                f"the readings of some {name} lie above or below what the volume projects to, {100 * size:.2g} % of "
+                f"the readings of some {name} lie above or below what the volume projects to, "
+                f"{100 * size:.2g} % of "
                 f"intensity (root mean square): {_cause(name, w, wr, lines, axes)}"
             )
     return ResidualTest(chi2, p_values, sizes, tuple(findings))
@@ -145,9 +168,9 @@ def residual_test(
 def _upper_tail(value: float, degrees: int, noncentrality: float) -> float:
     """Probability that a non-central χ² exceeds ``value``.
 
-    SciPy's own function overflows far below the mean, where the other tail is the small one, and takes seconds, or
-    fails, at the non-centralities of large scans. There the cube root of χ² is normal, to 2e-4 of
-    a probability (Abdel-Aty 1954, Biometrika 41:538).
+    SciPy's own function overflows far below the mean, where the other tail is the small one, and
+    takes seconds, or fails, at the non-centralities of large scans. There the cube root of χ² is
+    normal, to 2e-4 of a probability (Abdel-Aty 1954, Biometrika 41:538).
     """
     mean = degrees + noncentrality
     if mean > _LARGE:
@@ -162,7 +185,8 @@ def _upper_tail(value: float, degrees: int, noncentrality: float) -> float:
 def _cause(name: str, w: Tensor, wr: Tensor, lines: Tensor, axes: tuple[int, int]) -> str:
     """The likeliest causes of what some views or rows have in common, the likeliest first.
 
-    A gain changes all rays of a view or row alike. What only the dense ones show was done to them on their way.
+    A gain changes all rays of a view or row alike. What only the dense ones show was done to them
+    on their way.
     """
     gain = f"the gain changed from {name[:-1]} to {name[:-1]}, or the object moved"
     seen = lines[w > 0]
@@ -172,20 +196,29 @@ def _cause(name: str, w: Tensor, wr: Tensor, lines: Tensor, axes: tuple[int, int
         weight = (w * part).sum(axes)
         known = weight > 0
         off = (wr * part).sum(axes)[known] / weight[known]
-        sizes.append(math.sqrt(max(float((off.square() - 1.0 / weight[known]).mean()), 0.0)) if known.any() else 0.0)
+        sizes.append(
+            math.sqrt(max(float((off.square() - 1.0 / weight[known]).mean()), 0.0))
+            if known.any()
+            else 0.0
+        )
     light, dense = sizes
     if dense <= _DENSE_SHARE * light:
         return gain
     return (
-        f"beam hardening by bone or metal, or scatter, as the densest rays lie {100 * dense:.2g} % off and the others "
+        f"beam hardening by bone or metal, or scatter, as the densest rays lie {100 * dense:.2g} "
+        "% off and the others "
         f"{100 * light:.2g} %; or {gain}"
     )
 
 
 def _drift(total: Tensor, weight: Tensor) -> tuple[float, int]:
-    """χ² of slow additive changes over the views (a line, and a few harmonics), and its degrees of freedom."""
+    """χ² of slow additive changes over the views (a line, and a few harmonics), and its degrees
+    of freedom."""
     t = torch.linspace(-math.pi, math.pi, total.numel(), dtype=torch.float64)
-    waves = [t / math.pi, *(f(k * t) for k in range(1, _HARMONICS + 1) for f in (torch.cos, torch.sin))]
+    waves = [
+        t / math.pi,
+        *(f(k * t) for k in range(1, _HARMONICS + 1) for f in (torch.cos, torch.sin)),
+    ]
     patterns = torch.stack(waves)
     gram = (patterns * weight) @ patterns.T
     score = patterns @ total

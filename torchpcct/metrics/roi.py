@@ -1,9 +1,9 @@
 """Regions of interest on the finely interpolated axial image of the paper's protocol.
 
-The paper interpolates every reconstruction linearly to 0.035 mm voxels (an axial image of 256 × 256) and takes ROI
-means there. Interpolation and mean are linear, so an ROI mean is one inner product of the volume with a fixed weight
-volume: :class:`RoiMean` computes that weight volume once. It is also what the exact variance of a linear
-reconstruction needs (one adjoint pass per ROI).
+The paper interpolates every reconstruction linearly to 0.035 mm voxels (an axial image of 256 ×
+256) and takes ROI means there. Interpolation and mean are linear, so an ROI mean is one inner
+product of the volume with a fixed weight volume: :class:`RoiMean` computes that weight volume once.
+It is also what the exact variance of a linear reconstruction needs (one adjoint pass per ROI).
 """
 
 from __future__ import annotations
@@ -18,7 +18,14 @@ from torch import Tensor
 
 from torchpcct.geometry import VolumeGrid
 
-__all__ = ["PROTOCOL_PIXELS", "PROTOCOL_PIXEL_MM", "RoiMean", "as_array", "axial_grid", "sample_axial"]
+__all__ = [
+    "PROTOCOL_PIXELS",
+    "PROTOCOL_PIXEL_MM",
+    "RoiMean",
+    "as_array",
+    "axial_grid",
+    "sample_axial",
+]
 
 PROTOCOL_PIXEL_MM = 0.035
 PROTOCOL_PIXELS = 256
@@ -30,19 +37,25 @@ def as_array(image: Any) -> Any:
 
 
 def axial_grid(center: tuple[float, float, float]) -> VolumeGrid:
-    """The protocol's axial image: 256 × 256 pixels of 0.035 mm about ``center`` (z, y, x) in mm, one slice."""
+    """The protocol's axial image: 256 × 256 pixels of 0.035 mm about ``center`` (z, y, x) in mm,
+    one slice."""
     return VolumeGrid((1, PROTOCOL_PIXELS, PROTOCOL_PIXELS), PROTOCOL_PIXEL_MM, center)
 
 
-def _linear_weights(nodes: NDArray[np.float64], points: NDArray[np.float64], axis: str) -> NDArray[np.float64]:
-    """``(points, nodes)`` linear interpolation matrix; up to half a cell beyond the outer nodes is held constant."""
+def _linear_weights(
+    nodes: NDArray[np.float64], points: NDArray[np.float64], axis: str
+) -> NDArray[np.float64]:
+    """``(points, nodes)`` linear interpolation matrix; up to half a cell beyond the outer nodes
+    is held constant."""
     n = nodes.size
     step = nodes[1] - nodes[0] if n > 1 else np.inf
     position = (points - nodes[0]) / step if n > 1 else np.zeros(points.size)
     if n > 1 and (position.min() < -0.5 - 1e-6 or position.max() > n - 0.5 + 1e-6):
         raise ValueError(
-            f"the image reaches {axis} = {points.min():.3f} … {points.max():.3f} mm, beyond the volume's "
-            f"{nodes[0] - step / 2:.3f} … {nodes[-1] + step / 2:.3f} mm: reconstruct a larger grid or move the image"
+            f"the image reaches {axis} = {points.min():.3f} … {points.max():.3f} mm, beyond the "
+            "volume's "
+            f"{nodes[0] - step / 2:.3f} … {nodes[-1] + step / 2:.3f} mm: reconstruct a larger "
+            "grid or move the image"
         )
     position = np.clip(position, 0, n - 1)
     low = np.minimum(position.astype(np.int64), max(n - 2, 0))
@@ -56,12 +69,17 @@ def _linear_weights(nodes: NDArray[np.float64], points: NDArray[np.float64], axi
 
 def _matrices(grid: VolumeGrid, image: VolumeGrid) -> tuple[NDArray[np.float64], ...]:
     if grid.ndim != 3 or image.ndim != 3:
-        raise ValueError(f"volume and image grids must be (z, y, x), got {grid.shape} and {image.shape}")
-    return tuple(_linear_weights(g, p, a) for g, p, a in zip(grid.axes, image.axes, "zyx", strict=True))
+        raise ValueError(
+            f"volume and image grids must be (z, y, x), got {grid.shape} and {image.shape}"
+        )
+    return tuple(
+        _linear_weights(g, p, a) for g, p, a in zip(grid.axes, image.axes, "zyx", strict=True)
+    )
 
 
 def sample_axial(volume: Tensor, grid: VolumeGrid, image: VolumeGrid) -> Tensor:
-    """Trilinear interpolation of ``volume`` ``(..., z, y, x)`` on ``grid`` to the voxel centres of ``image``.
+    """Trilinear interpolation of ``volume`` ``(..., z, y, x)`` on ``grid`` to the voxel centres of
+    ``image``.
 
     Returns:
         ``(..., *image.shape)``, dtype and device of ``volume``.
@@ -101,7 +119,9 @@ class RoiMean:
         if mask.shape != self.image.shape:
             raise ValueError(f"mask has shape {mask.shape}, the image {self.image.shape}")
         if not mask.any():
-            raise ValueError("the ROI is empty: no pixel of the image lies in it; enlarge the ROI or move it")
+            raise ValueError(
+                "the ROI is empty: no pixel of the image lies in it; enlarge the ROI or move it"
+            )
         wz, wy, wx = _matrices(self.grid, self.image)
         weights = np.einsum("zyx,za,yb,xc->abc", mask / mask.sum(), wz, wy, wx, optimize=True)
         object.__setattr__(self, "mask", mask)
@@ -115,5 +135,9 @@ class RoiMean:
     def __call__(self, volume: Tensor) -> Tensor:
         """ROI mean of ``volume`` ``(..., z, y, x)``, ``(...)`` float64."""
         if tuple(volume.shape[-3:]) != self.grid.shape:
-            raise ValueError(f"volume has shape {tuple(volume.shape)}, the ROI's grid {self.grid.shape}")
-        return torch.einsum("...zyx,zyx->...", volume.to(torch.float64), self.weights.to(volume.device))
+            raise ValueError(
+                f"volume has shape {tuple(volume.shape)}, the ROI's grid {self.grid.shape}"
+            )
+        return torch.einsum(
+            "...zyx,zyx->...", volume.to(torch.float64), self.weights.to(volume.device)
+        )

@@ -1,4 +1,5 @@
-"""Which passes a tensor takes: the CPU's, or on CUDA the Triton counterparts, once they have reproduced the CPU's."""
+"""Which passes a tensor takes: the CPU's, or on CUDA the Triton counterparts, once they have
+reproduced the CPU's."""
 
 from __future__ import annotations
 
@@ -74,12 +75,31 @@ class Engine:
         """The Triton passes, with their tables on ``device``."""
         assert isinstance(self.tables, Tables)
         if device not in self._devices:
-            from torchpcct.projector.cpu.cone_kernels import MAX_LAYERS_PER_SLAB, NEAREST, tabulate_cells
+            from torchpcct.projector.cpu.cone_kernels import (
+                MAX_LAYERS_PER_SLAB,
+                NEAREST,
+                tabulate_cells,
+            )
 
             t, r = self.tables, self.tables.rays
-            cells, axes = np.empty((r.views, r.columns, 8)), np.empty((r.views, r.columns), dtype=np.int32)
-            tabulate_cells(t.segments.table, t.pose, r.edges, r.centers, r.first, t.lattice, r.parallel, cells, axes)
-            self._devices[device] = cuda.GpuPasses(t, device, cells, axes, NEAREST, MAX_LAYERS_PER_SLAB)
+            cells, axes = (
+                np.empty((r.views, r.columns, 8)),
+                np.empty((r.views, r.columns), dtype=np.int32),
+            )
+            tabulate_cells(
+                t.segments.table,
+                t.pose,
+                r.edges,
+                r.centers,
+                r.first,
+                t.lattice,
+                r.parallel,
+                cells,
+                axes,
+            )
+            self._devices[device] = cuda.GpuPasses(
+                t, device, cells, axes, NEAREST, MAX_LAYERS_PER_SLAB
+            )
         return self._devices[device]
 
     def shapes(self, transposed: bool) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -88,7 +108,8 @@ class Engine:
         return shapes[::-1] if transposed else shapes
 
     def apply(self, x: Tensor, transposed: bool) -> Tensor:
-        """One pass, ``(..., *domain_shape)`` to ``(..., *range_shape)`` or, ``transposed``, back; no autograd."""
+        """One pass, ``(..., *domain_shape)`` to ``(..., *range_shape)`` or, ``transposed``,
+        back; no autograd."""
         inner, outer = self.shapes(transposed)
         lead = x.shape[: x.dim() - len(inner)]
         batch = math.prod(lead)
@@ -96,9 +117,16 @@ class Engine:
             return x.new_zeros((*lead, *outer))
         flat = x.detach().reshape(batch, *inner)
         own = isinstance(self.tables, Tables)  # vectors have CPU passes only
-        if own and x.device.type == "cuda" and cuda.available() and self._trusted(x.device, x.dtype):
+        if (
+            own
+            and x.device.type == "cuda"
+            and cuda.available()
+            and self._trusted(x.device, x.dtype)
+        ):
             passes = self.on(x.device)
-            return (passes.adjoint(flat) if transposed else passes.forward(flat)).reshape(*lead, *outer)
+            return (passes.adjoint(flat) if transposed else passes.forward(flat)).reshape(
+                *lead, *outer
+            )
         return self._on_cpu(flat, transposed).reshape(*lead, *outer).to(x.device)
 
     def _on_cpu(self, x: Tensor, transposed: bool) -> Tensor:
@@ -108,13 +136,15 @@ class Engine:
         return torch.from_numpy(np.ascontiguousarray(result))
 
     def workspace(self, batch: int, itemsize: int, device: str) -> int:
-        """Bytes that one pass holds besides its input and output (the larger of the two directions)."""
+        """Bytes that one pass holds besides its input and output (the larger of the two
+        directions)."""
         if device == "cpu" or isinstance(self.tables, VectorTables):
             return self.cpu.workspace(batch, itemsize)
         return cuda.workspace(self.tables, batch, itemsize)
 
     def agrees(self, device: torch.device, dtype: torch.dtype) -> bool:
-        """True if the device's kernels reproduce the CPU's on random data of this scan, both ways; warns if not."""
+        """True if the device's kernels reproduce the CPU's on random data of this scan, both
+        ways; warns if not."""
         generator = torch.Generator().manual_seed(0)
         passes = self.on(device)
         for transposed in (False, True):
@@ -122,11 +152,15 @@ class Engine:
             expect = self._on_cpu(given, transposed)
             there = given.to(device)
             found = (passes.adjoint(there) if transposed else passes.forward(there)).cpu()
-            error = float((found - expect).norm() / expect.norm().clamp_min(torch.finfo(dtype).tiny))
+            error = float(
+                (found - expect).norm() / expect.norm().clamp_min(torch.finfo(dtype).tiny)
+            )
             if not error <= _TOLERANCE[dtype]:
                 warnings.warn(
-                    f"the Triton projector on {device} differs from the CPU's by {error:.1e} (allowed "
-                    f"{_TOLERANCE[dtype]:.0e}); the CPU's is used instead. Check the installed triton version.",
+                    f"the Triton projector on {device} differs from the CPU's by {error:.1e} "
+                    "(allowed "
+                    f"{_TOLERANCE[dtype]:.0e}); the CPU's is used instead. Check the installed "
+                    "triton version.",
                     RuntimeWarning,
                     stacklevel=2,
                 )
@@ -134,7 +168,8 @@ class Engine:
         return True
 
     def _trusted(self, device: torch.device, dtype: torch.dtype) -> bool:
-        """:meth:`agrees`, checked once per device, dtype and kind of scan, on a scan of a few views and voxels."""
+        """:meth:`agrees`, checked once per device, dtype and kind of scan, on a scan of a few
+        views and voxels."""
         kind = type(self.tables.geometry)
         key = (f"{device} {kind.__name__}", dtype)
         if key not in _CHECKED:

@@ -1,4 +1,5 @@
-"""The projector as a PyTorch module: line integrals of a grid, and the exact adjoint of the same weights."""
+"""The projector as a PyTorch module: line integrals of a grid, and the exact adjoint of the same
+weights."""
 
 from __future__ import annotations
 
@@ -29,21 +30,25 @@ _NARROW = (torch.float16, torch.bfloat16)
 
 
 class Operator(nn.Module):
-    """Passes of an engine from ``domain_shape`` to ``range_shape``, and their matched adjoint ``T``."""
+    """Passes of an engine from ``domain_shape`` to ``range_shape``, and their matched adjoint
+    ``T``."""
 
     def __init__(self, engine: Engine, transposed: bool = False) -> None:
         super().__init__()
         self._engine, self._transposed = engine, transposed
-        self._other: list[Operator] = []  # in a list: a submodule that holds its parent would recurse
+        # in a list: a submodule that holds its parent would recurse
+        self._other: list[Operator] = []
 
     @property
     def domain_shape(self) -> tuple[int, ...]:
-        """Shape of one input: of a :class:`Projector` that of a volume, ``(y, x)`` or ``(z, y, x)``."""
+        """Shape of one input: of a :class:`Projector` that of a volume, ``(y, x)`` or ``(z, y,
+        x)``."""
         return self._engine.shapes(self._transposed)[0]
 
     @property
     def range_shape(self) -> tuple[int, ...]:
-        """Shape of one output: of a :class:`Projector` ``(views, columns)`` or ``(views, rows, columns)``."""
+        """Shape of one output: of a :class:`Projector` ``(views, columns)`` or ``(views, rows,
+        columns)``."""
         return self._engine.shapes(self._transposed)[1]
 
     @property
@@ -65,23 +70,29 @@ class Operator(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         name, operator = ("y", "A.T") if self._transposed else ("x", "A")
-        return _apply(_checked(x, self.domain_shape, name, operator), self._engine, self._transposed)
+        return _apply(
+            _checked(x, self.domain_shape, name, operator), self._engine, self._transposed
+        )
 
     def extra_repr(self) -> str:
-        return f"{type(self._engine.tables.geometry).__name__}, {self.domain_shape} -> {self.range_shape}"
+        return (
+            f"{type(self._engine.tables.geometry).__name__}, {self.domain_shape} -> "
+            f"{self.range_shape}"
+        )
 
     @undisturbed
     def norm(self, tolerance: float = 1e-4, most: int = 200) -> float:
         """Largest singular value, by power iteration on AᵀA in float32; kept after the first call.
 
         Args:
-            tolerance: stop when the value grows by less than this share in one iteration. It is approached from
-                below.
+            tolerance: stop when the value grows by less than this share in one iteration. It is
+                approached from below.
             most: largest number of iterations, one pass in either direction each.
         """
         kept = self.__dict__.get("_norm")
         if kept is None or kept[0] > tolerance:
-            # A constant start is near the largest eigenvector, and the noise keeps it from being orthogonal to it.
+            # A constant start is near the largest eigenvector, and the noise keeps it from being
+            # orthogonal to it.
             noise = torch.rand(self.domain_shape, generator=torch.Generator().manual_seed(0))
             x, value = 1 + noise, 0.0
             for _ in range(most):
@@ -111,7 +122,9 @@ class Operator(nn.Module):
 
         def columns(operator: Operator, values: Any) -> Any:
             # Columns of a matrix are a batch.
-            batch = np.ascontiguousarray(np.asarray(values, dtype=dtype).reshape(values.shape[0], -1).T)
+            batch = np.ascontiguousarray(
+                np.asarray(values, dtype=dtype).reshape(values.shape[0], -1).T
+            )
             with torch.no_grad():
                 out = operator(torch.from_numpy(batch).reshape(-1, *operator.domain_shape))
             return out.reshape(len(batch), -1).numpy().T.reshape(-1, *values.shape[1:])
@@ -147,7 +160,8 @@ class Operator(nn.Module):
 
 
 class _Linear(torch.autograd.Function):
-    """``forward(x)``; its gradient is ``transpose``, whose gradient is ``forward`` again (any order)."""
+    """``forward(x)``; its gradient is ``transpose``, whose gradient is ``forward`` again (any
+    order)."""
 
     @staticmethod
     def forward(x: Tensor, forward: Linear, transpose: Linear) -> Tensor:
@@ -167,20 +181,26 @@ class _Linear(torch.autograd.Function):
         return _Linear.apply(tangents[0], ctx.forward_map, ctx.transpose_map)
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[Any, ...], x: Tensor, forward: Linear, transpose: Linear) -> tuple[Tensor, int]:
+    def vmap(
+        info: Any, in_dims: tuple[Any, ...], x: Tensor, forward: Linear, transpose: Linear
+    ) -> tuple[Tensor, int]:
         # Leading dimensions are batch dimensions already.
         return _Linear.apply(x.movedim(in_dims[0], 0), forward, transpose), 0
 
 
 def apply_linear(x: Tensor, forward: Linear, transpose: Linear) -> Tensor:
-    """``forward(x)`` with gradients of any order; both maps take and keep leading batch dimensions."""
+    """``forward(x)`` with gradients of any order; both maps take and keep leading batch
+    dimensions."""
     return cast(Tensor, _Linear.apply(x, forward, transpose))
 
 
-# torch.compile and torch.export cannot look into numba kernels; to them a pass is one operation. An exported program
-# holds the handle of its engine: it runs in the process that exported it, while the projector lives.
+# torch.compile and torch.export cannot look into numba kernels; to them a pass is one operation. An
+# exported program holds the handle of its engine: it runs in the process that exported it, while
+# the projector lives.
 @torch.library.custom_op(
-    "torchpcct::project", mutates_args=(), schema="(Tensor x, int engine, bool transposed) -> Tensor"
+    "torchpcct::project",
+    mutates_args=(),
+    schema="(Tensor x, int engine, bool transposed) -> Tensor",
 )
 def _traced(x: Tensor, engine: int, transposed: bool) -> Tensor:
     return ENGINES[engine].apply(x, transposed)
@@ -206,43 +226,51 @@ _traced.register_autograd(_back, setup_context=_note)
 def _apply(x: Tensor, engine: Engine, transposed: bool) -> Tensor:
     if torch.compiler.is_compiling():
         return cast(Tensor, _traced(x, engine.handle, transposed))
-    return apply_linear(x, *(partial(engine.apply, transposed=way) for way in (transposed, not transposed)))
+    return apply_linear(
+        x, *(partial(engine.apply, transposed=way) for way in (transposed, not transposed))
+    )
 
 
 class Projector(Operator):
     """Cell-averaged line integrals of a voxel grid, and the exact adjoint.
 
-    The model is distance-driven (De Man and Basu 2004, Phys. Med. Biol. 49:2463): in every slab of voxels a reading is
-    the mean over the detector cell projected onto the slab's middle plane, times the path. It stays accurate for
-    voxels much smaller and much larger than the cell. Rays choose their slabs (grid rows or columns) one by one,
-    not view by view, so that the edges of a wide fan are as accurate as its centre.
+    The model is distance-driven (De Man and Basu 2004, Phys. Med. Biol. 49:2463): in every slab of
+    voxels a reading is the mean over the detector cell projected onto the slab's middle plane,
+    times the path. It stays accurate for voxels much smaller and much larger than the cell. Rays
+    choose their slabs (grid rows or columns) one by one, not view by view, so that the edges of a
+    wide fan are as accurate as its centre.
 
     Shape:
-        - ``A(x)``: ``(..., *domain_shape)`` → ``(..., *range_shape)``, any number of leading batch dimensions.
+        - ``A(x)``: ``(..., *domain_shape)`` → ``(..., *range_shape)``, any number of leading batch
+          dimensions.
         - ``A.T(y)``: ``(..., *range_shape)`` → ``(..., *domain_shape)``.
 
-    In and out have one dtype (float32 or float64) and one device; float16 and bfloat16, as autocast leaves them, are
-    computed and returned in float32. ``A @ x``, ``A.H``, ``A.norm()`` and the operator in the form of other libraries
-    (``as_scipy``, ``as_pylops``, ``as_deepinv``) come from :class:`Operator`. Units: ``x``
-    in mm⁻¹ gives line integrals without unit. Both directions are differentiable any number of times and work under
-    ``torch.func``. NaN and Inf in the input reach the output (a NaN may also reach readings that share a grid line with
-    it). ``torch.compile`` and, within the process, ``torch.export`` take a pass as one operation. The module has no
-    parameters and no state. On CUDA the Triton kernels are used if Triton is installed and their first-use check
-    against the CPU passes; otherwise the data travel to the CPU and back.
+    In and out have one dtype (float32 or float64) and one device; float16 and bfloat16, as autocast
+    leaves them, are computed and returned in float32. ``A @ x``, ``A.H``, ``A.norm()`` and the
+    operator in the form of other libraries (``as_scipy``, ``as_pylops``, ``as_deepinv``) come from
+    :class:`Operator`. Units: ``x`` in mm⁻¹ gives line integrals without unit. Both directions are
+    differentiable any number of times and work under ``torch.func``. NaN and Inf in the input reach
+    the output (a NaN may also reach readings that share a grid line with it). ``torch.compile``
+    and, within the process, ``torch.export`` take a pass as one operation. The module has no
+    parameters and no state. On CUDA the Triton kernels are used if Triton is installed and their
+    first-use check against the CPU passes; otherwise the data travel to the CPU and back.
 
     Args:
-        geometry: ``ParallelBeam`` or ``FanBeam`` with a 2-D grid, ``ConeBeam`` with a 3-D grid; or a
-            :class:`~torchpcct.vector_geometry.VectorGeometry`: what is a circular scan, at rest or moving (a helix),
-            takes the passes of one, anything else general ones on the CPU, several times slower.
+        geometry: ``ParallelBeam`` or ``FanBeam`` with a 2-D grid, ``ConeBeam`` with a 3-D grid; or
+            a :class:`~torchpcct.vector_geometry.VectorGeometry`: what is a circular scan, at rest
+            or moving (a helix), takes the passes of one, anything else general ones on the CPU,
+            several times slower.
         grid: the voxel grid.
-        window: the part of the detector to compute (``torchpcct.detector_window.footprint``), or None for all of it.
-        motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z, y, x) mm, or None:
-            a volume that moves rigidly with its object is projected and reconstructed at rest.
+        window: the part of the detector to compute (``torchpcct.detector_window.footprint``), or
+            None for all of it.
+        motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z,
+            y, x) mm, or None: a volume that moves rigidly with its object is projected and
+            reconstructed at rest.
 
     Raises:
         TypeError: an argument of the wrong kind, an input that is not float32 or float64.
-        ValueError: geometry, grid, window and motion that do not fit together, a source inside the grid, an input
-            of the wrong shape.
+        ValueError: geometry, grid, window and motion that do not fit together, a source inside the
+            grid, an input of the wrong shape.
     """
 
     def __init__(
@@ -265,8 +293,9 @@ class Projector(Operator):
         Args:
             batch: number of volumes (or sinograms) in the pass.
             dtype: float32 or float64.
-            device: where the pass runs, "cpu" or a CUDA device: there the estimate is that of the whole batch; what
-                does not fit into half of the free memory goes through in slices, the same bit for bit.
+            device: where the pass runs, "cpu" or a CUDA device: there the estimate is that of the
+                whole batch; what does not fit into half of the free memory goes through in slices,
+                the same bit for bit.
 
         Raises:
             TypeError: another dtype. ValueError: a negative batch.
@@ -286,22 +315,36 @@ def _tables(geometry: Any, grid: Any, window: Any, motion: Any) -> Tables | Vect
     if not isinstance(geometry, VectorGeometry):
         return Tables(geometry, grid, window, motion)
     if window is not None:
-        raise ValueError("a window belongs to a circular scan; of a VectorGeometry select the views, or use all of it")
+        raise ValueError(
+            "a window belongs to a circular scan; of a VectorGeometry select the views, or use "
+            "all of it"
+        )
     if motion is not None:
         geometry = geometry.moved(motion)
     circular = geometry.as_circular()
-    return VectorTables(geometry, grid) if circular is None else Tables(circular[0], grid, None, circular[1])
+    return (
+        VectorTables(geometry, grid)
+        if circular is None
+        else Tables(circular[0], grid, None, circular[1])
+    )
 
 
 def _checked(x: Any, inner: tuple[int, ...], name: str, operator: str) -> Tensor:
     """``x`` in float32 or float64."""
     if not isinstance(x, Tensor):
-        raise TypeError(f"{operator}({name}) needs a torch.Tensor, got {type(x).__name__}: use torch.as_tensor({name})")
+        raise TypeError(
+            f"{operator}({name}) needs a torch.Tensor, got {type(x).__name__}: use "
+            f"torch.as_tensor({name})"
+        )
     if x.dtype in _NARROW:  # of an autocast region: sums of hundreds of voxels need more digits
         x = x.float()
     if x.dtype not in _DTYPES:
-        raise TypeError(f"{operator}({name}) needs float32 or float64, got {x.dtype}: use {name}.float()")
+        raise TypeError(
+            f"{operator}({name}) needs float32 or float64, got {x.dtype}: use {name}.float()"
+        )
     if tuple(x.shape[-len(inner) :]) != inner:
-        raise ValueError(f"{operator}({name}) needs a tensor of shape (..., {', '.join(map(str, inner))}), "
-                         f"got {tuple(x.shape)}")  # fmt: skip
+        raise ValueError(
+            f"{operator}({name}) needs a tensor of shape (..., {', '.join(map(str, inner))}), "
+            f"got {tuple(x.shape)}"
+        )
     return x

@@ -1,10 +1,11 @@
-"""Where the rays of every view run: per-view poses, cell edges, and the split of each view by its main axis.
+"""Where the rays of every view run: per-view poses, cell edges, and the split of each view by its
+main axis.
 
-The kernels never see a geometry. They see, for each view, a source, an in-plane vector ``axial`` and an in-plane
-vector ``across``; the in-plane ray of the detector position with table entries ``(a, b)`` points along
-``a * axial + b * across``. Flat detector: ``a = 1, b = u``. Curved: ``a = cos γ, b = sdd * sin γ``. Both reach the
-detector at the ray parameter λ = 1, so that heights scale with λ. A parallel beam has the one direction ``axial``
-and starts at ``source + b * across``.
+The kernels never see a geometry. They see, for each view, a source, an in-plane vector ``axial``
+and an in-plane vector ``across``; the in-plane ray of the detector position with table entries
+``(a, b)`` points along ``a * axial + b * across``. Flat detector: ``a = 1, b = u``. Curved: ``a =
+cos γ, b = sdd * sin γ``. Both reach the detector at the ray parameter λ = 1, so that heights scale
+with λ. A parallel beam has the one direction ``axial`` and starts at ``source + b * across``.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ class Rays:
         foot_z: ``(views,)`` height of the detector position ``v = 0``.
         edges: ``(columns + 1, 2)`` table entries (a, b) of the cell edges.
         centers: ``(columns, 2)`` table entries of the cell centres.
-        row_edge, row_pitch: height of the first row's lower edge above ``v = 0``, and the row pitch (2-D: -0.5, 1).
+        row_edge, row_pitch: height of the first row's lower edge above ``v = 0``, and the row pitch
+            (2-D: -0.5, 1).
         first: ``(views,)`` first column kept in each view.
         columns, first_row, rows: the columns and rows kept.
     """
@@ -62,13 +64,19 @@ class Rays:
 
     @property
     def pose(self) -> Floats:
-        """``(views, 8)``: source x, y, z; axial x, y; across x, y; foot height. What the kernels read."""
+        """``(views, 8)``: source x, y, z; axial x, y; across x, y; foot height. What the kernels
+        read."""
         return np.ascontiguousarray(
-            np.concatenate([self.source, self.axial, self.across, self.foot_z[:, None]], axis=1, dtype=np.float64)
+            np.concatenate(
+                [self.source, self.axial, self.across, self.foot_z[:, None]],
+                axis=1,
+                dtype=np.float64,
+            )
         )
 
     def moved(self, shift: Floats) -> Rays:
-        """The rays seen from an object displaced by ``shift``, ``(views, 2)`` (y, x) or ``(views, 3)`` (z, y, x) mm."""
+        """The rays seen from an object displaced by ``shift``, ``(views, 2)`` (y, x) or
+        ``(views, 3)`` (z, y, x) mm."""
         source = self.source.copy()
         source[:, :2] -= shift[:, :-3:-1]
         if shift.shape[1] == 2:
@@ -82,17 +90,24 @@ def check_pair(geometry: Any, grid: Any, window: Any) -> None:
 
     Raises:
         TypeError: an argument of the wrong kind.
-        ValueError: a 3-D grid with a 2-D geometry or the reverse, a window that does not fit the detector.
+        ValueError: a 3-D grid with a 2-D geometry or the reverse, a window that does not fit the
+            detector.
     """
     if not isinstance(geometry, ParallelBeam | FanBeam | ConeBeam):
-        raise TypeError(f"geometry must be ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}")
+        raise TypeError(
+            f"geometry must be ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}"
+        )
     if not isinstance(grid, VolumeGrid):
         raise TypeError(f"grid must be a VolumeGrid, got {type(grid).__name__}")
     axes = 3 if isinstance(geometry, ConeBeam) else 2
     if grid.ndim != axes:
         raise ValueError(
             f"{type(geometry).__name__} needs a {axes}-D grid, got shape {grid.shape}: "
-            + ("use FanBeam for one slice" if axes == 3 else "use grid.slice, or ConeBeam for a volume")
+            + (
+                "use FanBeam for one slice"
+                if axes == 3
+                else "use grid.slice, or ConeBeam for a volume"
+            )
         )
     if window is None:
         return
@@ -111,7 +126,11 @@ def rays_of(geometry: Geometry, window: DetectorWindow | None = None) -> Rays:
     centers = geometry.column_positions  # type: ignore[attr-defined]
     pitch = geometry.pitch  # type: ignore[attr-defined]
     if isinstance(geometry, ConeBeam):
-        row_edge, row_pitch, rows = geometry.row_positions[0] - pitch[0] / 2, pitch[0], geometry.rows
+        row_edge, row_pitch, rows = (
+            geometry.row_positions[0] - pitch[0] / 2,
+            pitch[0],
+            geometry.rows,
+        )
         pitch = pitch[1]
     edges = np.append(centers - pitch / 2, centers[-1] + pitch / 2)
     source = np.zeros((views, 3))
@@ -124,7 +143,9 @@ def rays_of(geometry: Geometry, window: DetectorWindow | None = None) -> Rays:
         axial = -geometry.sdd * radial
         if geometry.detector == "curved":
             table = [
-                np.stack([np.cos(t / geometry.sdd), geometry.sdd * np.sin(t / geometry.sdd)], axis=1)
+                np.stack(
+                    [np.cos(t / geometry.sdd), geometry.sdd * np.sin(t / geometry.sdd)], axis=1
+                )
                 for t in (edges, centers)
             ]
         else:
@@ -151,12 +172,13 @@ def rays_of(geometry: Geometry, window: DetectorWindow | None = None) -> Rays:
 class Segments:
     """Runs of neighbouring columns of a view whose rays share their main axis.
 
-    Rays that cross more grid rows than columns are followed row by row (axis 0), the others column by column (axis 1),
-    whatever the view: this keeps the step along a grid line below one voxel for every ray of a wide fan.
+    Rays that cross more grid rows than columns are followed row by row (axis 0), the others column
+    by column (axis 1), whatever the view: this keeps the step along a grid line below one voxel for
+    every ray of a wide fan.
 
     Args:
-        table: ``(segments, 4)`` int64: view, axis, first column (within the window), number of columns;
-            sorted by view.
+        table: ``(segments, 4)`` int64: view, axis, first column (within the window), number of
+            columns; sorted by view.
         start: ``(views + 1,)`` int64, the segments of view ``v`` are ``start[v]:start[v + 1]``.
     """
 
@@ -175,7 +197,8 @@ def split(rays: Rays, grid: VolumeGrid) -> Segments:
         b = np.zeros_like(cell[..., 1]) if rays.parallel else cell[..., 1]
         dx = cell[..., 0] * rays.axial[view, None, 0] + b * rays.across[view, None, 0]
         dy = cell[..., 0] * rays.axial[view, None, 1] + b * rays.across[view, None, 1]
-        # A hair's breadth in favour of rows, so that exact diagonals do not flip with the rounding of the cosine.
+        # A hair's breadth in favour of rows, so that exact diagonals do not flip with the rounding
+        # of the cosine.
         along_x = (np.abs(dx) * hy > np.abs(dy) * hx * (1 + 1e-9)).astype(np.int64)
         change = np.diff(along_x, axis=1) != 0
         cut = np.concatenate([np.ones((along_x.shape[0], 1), bool), change], axis=1)
@@ -189,8 +212,8 @@ def split(rays: Rays, grid: VolumeGrid) -> Segments:
 
 
 def slab_lattice(center: Sequence[float], shape: Sequence[int], spacing: Sequence[float]) -> Floats:
-    """``(8,)`` mm: y of the first row of voxels and the row pitch, x of the first voxel edge and the pitch along a row;
-    then the same for columns. All arguments ``(y, x)``."""
+    """``(8,)`` mm: y of the first row of voxels and the row pitch, x of the first voxel edge and
+    the pitch along a row; then the same for columns. All arguments ``(y, x)``."""
     (hy, hx), (ny, nx) = spacing, shape
     y, x = center[0] - (ny - 1) / 2 * hy, center[1] - (nx - 1) / 2 * hx
     return np.array([y, hy, x - hx / 2, hx, x, hx, y - hy / 2, hy])
@@ -210,9 +233,11 @@ def check_source(place: Floats, grid: VolumeGrid) -> None:
     if inside.any():
         view = int(inside.argmax())
         x, extent, center = (
-            ", ".join(f"{v:.4g}" for v in values[::-1]) for values in (place[view], grid.extent, grid.center)
+            ", ".join(f"{v:.4g}" for v in values[::-1])
+            for values in (place[view], grid.extent, grid.center)
         )
         raise ValueError(
-            f"the source of view {view} at {x} mm lies inside the grid of {extent} mm about {center} mm: shrink or "
+            f"the source of view {view} at {x} mm lies inside the grid of {extent} mm about "
+            f"{center} mm: shrink or "
             "move the grid, or move the source away (a larger sod)"
         )

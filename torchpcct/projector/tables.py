@@ -1,4 +1,5 @@
-"""What one geometry, grid and window come to, computed once for all passes: rays, slabs, depth layers."""
+"""What one geometry, grid and window come to, computed once for all passes: rays, slabs, depth
+layers."""
 
 from __future__ import annotations
 
@@ -11,7 +12,14 @@ from numpy.typing import NDArray
 
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, VolumeGrid
-from torchpcct.projector.rays import Segments, check_pair, check_source, rays_of, slab_lattice, split
+from torchpcct.projector.rays import (
+    Segments,
+    check_pair,
+    check_source,
+    rays_of,
+    slab_lattice,
+    split,
+)
 from torchpcct.vector_geometry import VectorGeometry, check_motion
 
 __all__ = ["Tables", "VectorTables", "layer_spacing"]
@@ -39,12 +47,17 @@ class Tables:
     ) -> None:
         check_pair(geometry, grid, window)
         # Symmetric views share their work only if all of the detector is read and nothing moves.
-        self.geometry, self.grid, self.windowed = geometry, grid, window is not None or motion is not None
+        self.geometry, self.grid, self.windowed = (
+            geometry,
+            grid,
+            window is not None or motion is not None,
+        )
         self.rays = rays_of(geometry, window)
         if motion is not None:
             self.rays = self.rays.moved(check_motion(motion, geometry.views, grid.ndim))
         if not self.rays.parallel:
-            check_source(self.rays.source[:, 1::-1], grid.slice)  # in the plane, whatever the source's height
+            # in the plane, whatever the source's height
+            check_source(self.rays.source[:, 1::-1], grid.slice)
         self.lattice = slab_lattice(grid.center[-2:], grid.shape[-2:], grid.spacing[-2:])
 
     @property
@@ -67,9 +80,15 @@ class Tables:
 
     @cached_property
     def heights(self) -> tuple[float, float, float, float]:
-        """Lower edge of the grid along z, its pitch, lower edge of the first row kept, row pitch, mm (cone beam)."""
+        """Lower edge of the grid along z, its pitch, lower edge of the first row kept, row
+        pitch, mm (cone beam)."""
         z, dz = self.grid.axes[0][0], self.grid.spacing[0]
-        return (z - dz / 2, dz, self.rays.row_edge + self.rays.first_row * self.rays.row_pitch, self.rays.row_pitch)
+        return (
+            z - dz / 2,
+            dz,
+            self.rays.row_edge + self.rays.first_row * self.rays.row_pitch,
+            self.rays.row_pitch,
+        )
 
     @cached_property
     def layer(self) -> float:
@@ -80,7 +99,8 @@ class Tables:
 
 
 class VectorTables:
-    """The same of a scan given by vectors that no circular scan describes; its passes need no tables.
+    """The same of a scan given by vectors that no circular scan describes; its passes need no
+    tables.
 
     Args:
         geometry, grid: as for ``Projector``.
@@ -95,7 +115,10 @@ class VectorTables:
             raise TypeError(f"grid must be a VolumeGrid, got {type(grid).__name__}")
         axes = 2 if geometry.rows is None else 3
         if grid.ndim != axes:
-            raise ValueError(f"vectors of {len(geometry.vectors[0])} numbers need a {axes}-D grid, got {grid.shape}")
+            raise ValueError(
+                f"vectors of {len(geometry.vectors[0])} numbers need a {axes}-D grid, got "
+                f"{grid.shape}"
+            )
         self.geometry, self.grid = geometry, grid
         if not geometry.parallel:
             check_source(geometry.poses[:, 0, :axes][:, ::-1], grid)
@@ -109,19 +132,24 @@ class VectorTables:
         return self.geometry.shape
 
 
-def layer_spacing(pose: NDArray[np.float64], grid: VolumeGrid, row0: float, row_pitch: float, rows: int) -> float:
-    """Spacing of depth layers in the ray parameter λ; layers replace slabs where slabs are closer than this.
+def layer_spacing(
+    pose: NDArray[np.float64], grid: VolumeGrid, row0: float, row_pitch: float, rows: int
+) -> float:
+    """Spacing of depth layers in the ray parameter λ; layers replace slabs where slabs are closer
+    than this.
 
-    The heights of the row edges grow with λ, so each slab needs its own interpolation along z. Where the magnification
-    changes little (a small grid), slabs are instead shared linearly between two layers, and only layers are
-    interpolated. Between two layers the row edges move by at most ``LAYER_SHIFT`` of the blur that the voxel and the
-    row have anyway; the error is of second order in it.
+    The heights of the row edges grow with λ, so each slab needs its own interpolation along z.
+    Where the magnification changes little (a small grid), slabs are instead shared linearly between
+    two layers, and only layers are interpolated. Between two layers the row edges move by at most
+    ``LAYER_SHIFT`` of the blur that the voxel and the row have anyway; the error is of second order
+    in it.
     """
     z, hz = grid.axes[0], grid.spacing[0]
     reach = max(abs(z[0] - hz / 2 - pose[:, 2]).max(), abs(z[-1] + hz / 2 - pose[:, 2]).max())
     ends = np.array([row0, row0 + rows * row_pitch])
     rise = np.abs(ends + (pose[:, 7] - pose[:, 2])[:, None]).max()
-    # Depths of the grid's corners and centre in every view; rows are finest, and moves largest, at the nearest.
+    # Depths of the grid's corners and centre in every view; rows are finest, and moves largest, at
+    # the nearest.
     x, y = (grid.center[i] + grid.extent[i] / 2 * np.array([-1, -1, 1, 1, 0]) for i in (2, 1))
     y[:4] = y[[0, 2, 0, 2]]
     offset = np.stack([x, y], axis=-1) - pose[:, None, :2]

@@ -1,9 +1,10 @@
 """Scanners: tube, filters, bowties, detectors and presets.
 
-Reading order, along the beam: ``source`` (spectrum) → ``filters`` (slabs, bowties) → ``detector`` (what a photon leaves
-in each bin, with ``compton``) → ``scanner``, which puts them together with a geometry; ``presets`` are the paper's two.
-What a scanner makes of its readings: ``pileup`` and ``linearisation`` (water correction). ``silicon_transport`` follows
-single photons as a reference for the silicon detector; its ``TransportedSilicon`` counts what they do.
+Reading order, along the beam: ``source`` (spectrum) → ``filters`` (slabs, bowties) → ``detector``
+(what a photon leaves in each bin, with ``compton``) → ``scanner``, which puts them together with a
+geometry; ``presets`` are the paper's two. What a scanner makes of its readings: ``pileup`` and
+``linearisation`` (water correction). ``silicon_transport`` follows single photons as a reference
+for the silicon detector; its ``TransportedSilicon`` counts what they do.
 """
 
 from torchpcct.scanner import presets

@@ -26,27 +26,31 @@ def _gauss_legendre() -> tuple[Floats, Floats]:
 
 @checked
 def recoil(energies_kev: ArrayLike) -> tuple[Floats, Floats]:
-    """Recoil-electron energies and their probabilities (Klein and Nishina 1929; binding is neglected).
+    """Recoil-electron energies and their probabilities (Klein and Nishina 1929; binding is
+    neglected).
 
-    Gauss–Legendre quadrature over the cosine of the scattering angle: ``Σ_k p_k f(T_k)`` integrates smooth ``f``.
+    Gauss–Legendre quadrature over the cosine of the scattering angle: ``Σ_k p_k f(T_k)`` integrates
+    smooth ``f``.
 
     Args:
         energies_kev: ``(E,)`` photon energies in keV.
 
     Returns:
-        ``T`` (E, nodes) in keV, from 0 up to the Compton edge 2E²/(mc² + 2E); ``p`` (E, nodes), summing to 1 over
-        the nodes.
+        ``T`` (E, nodes) in keV, from 0 up to the Compton edge 2E²/(mc² + 2E); ``p`` (E, nodes),
+        summing to 1 over the nodes.
     """
     energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))[:, None]
     cosine, weight = _gauss_legendre()
-    ratio = 1.0 / (1.0 + energies / ELECTRON_REST_KEV * (1.0 - cosine))  # scattered over incident energy
+    # scattered over incident energy
+    ratio = 1.0 / (1.0 + energies / ELECTRON_REST_KEV * (1.0 - cosine))
     density = weight * ratio**2 * (ratio + 1.0 / ratio - (1.0 - cosine**2))
     return energies * (1.0 - ratio), density / density.sum(axis=1, keepdims=True)
 
 
 @checked
 def mean_recoil_fraction(energies_kev: ArrayLike) -> Floats:
-    """Mean share of the photon's energy that a Compton interaction gives to the electron, ``(E,)``."""
+    """Mean share of the photon's energy that a Compton interaction gives to the electron,
+    ``(E,)``."""
     energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))
     t, p = recoil(energies)
     return np.asarray((t * p).sum(axis=1) / energies)

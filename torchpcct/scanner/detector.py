@@ -1,9 +1,10 @@
 """Detectors: what one incident photon leaves in each reading.
 
-A detector turns photons that reach a cell into *bins* of signal. ``response(energies)`` is the expected signal per
-incident photon and ``variance(energies)`` its second moment, so that for Poisson-distributed photons N(E) the reading
-of bin i has mean Σ N response_i and variance Σ N variance_i + electronic_noise². A counting detector has response =
-variance (a sum of Poisson numbers is Poisson); an energy-integrating one has one bin, in keV.
+A detector turns photons that reach a cell into *bins* of signal. ``response(energies)`` is the
+expected signal per incident photon and ``variance(energies)`` its second moment, so that for
+Poisson-distributed photons N(E) the reading of bin i has mean Σ N response_i and variance Σ N
+variance_i + electronic_noise². A counting detector has response = variance (a sum of Poisson
+numbers is Poisson); an energy-integrating one has one bin, in keV.
 """
 
 from __future__ import annotations
@@ -35,18 +36,20 @@ SILICON_SIGMA_KEV = 1.6
 """Assumed energy resolution (standard deviation) of a silicon strip with its electronics."""
 
 SILICON_FILL_FACTOR = 0.96
-"""Assumed sensitive share of a cell: tungsten foils of 20 µm between silicon sheets at 0.5 mm pitch absorb the rest."""
+"""Assumed sensitive share of a cell: tungsten foils of 20 µm between silicon sheets at 0.5 mm
+pitch absorb the rest."""
 
 SEGMENT_DESIGN_KEV = 60.0
 """Assumed energy at which the depth segments share the load equally."""
 
 SCINTILLATOR_DEPTH_MM = 3.0
 SCINTILLATOR_FILL_FACTOR = 0.81
-"""Assumed sensitive share of a scintillator cell: 0.9 in either direction (public CatSim/XCIST default)."""
+"""Assumed sensitive share of a scintillator cell: 0.9 in either direction (public CatSim/XCIST
+default)."""
 
 SCINTILLATOR_NOISE_KEV = 206.0
-"""Assumed electronic noise of an energy-integrating cell, per reading: 3500 electrons at 17 electrons per keV (public
-CatSim/XCIST default)."""
+"""Assumed electronic noise of an energy-integrating cell, per reading: 3500 electrons at 17
+electrons per keV (public CatSim/XCIST default)."""
 
 _MODES = ("counting", "spectral")
 
@@ -81,28 +84,30 @@ class Detector(Protocol):
 class SiliconDetector:
     """Edge-on ("deep") silicon strips that count photons in energy bins.
 
-    Model: a photon that reaches the silicon interacts once, photoelectrically (all its energy stays: electron range and
-    fluorescence escape are negligible at this size) or by Compton scattering (the recoil electron's energy stays,
-    distributed after Klein and Nishina; the scattered photon is lost to the tungsten foils or leaves). Coherent scatter
-    is forward peaked and taken as no interaction. Energies are blurred by a normal distribution and sorted by the
+    Model: a photon that reaches the silicon interacts once, photoelectrically (all its energy
+    stays: electron range and fluorescence escape are negligible at this size) or by Compton
+    scattering (the recoil electron's energy stays, distributed after Klein and Nishina; the
+    scattered photon is lost to the tungsten foils or leaves). Coherent scatter is forward peaked
+    and taken as no interaction. Energies are blurred by a normal distribution and sorted by the
     thresholds; what lies below the lowest one is lost.
 
     Args:
-        mode: ``"spectral"``: one bin per threshold, the last one open; ``"counting"``: one bin, their sum.
+        mode: ``"spectral"``: one bin per threshold, the last one open; ``"counting"``: one bin,
+            their sum.
         thresholds_kev: lower edges of the bins in keV, increasing.
         length_mm: length of silicon along the beam.
-        segments: number of depth segments, read out one by one and summed; they share the count rate
-            (:meth:`segment_shares`), which matters for pile-up only.
+        segments: number of depth segments, read out one by one and summed; they share the count
+            rate (:meth:`segment_shares`), which matters for pile-up only.
         sigma_kev: standard deviation of the recorded energy.
         fill_factor: sensitive share of the cell's area (tungsten foils, guard structures).
         dead_layer_mm: insensitive silicon at the entrance.
-        charge_sharing: share of the interactions whose charge is split, at a uniformly distributed ratio, between two
-            cells; each part counts where it exceeds a threshold. 0 switches it off. The correlation that it makes
-            between neighbours is not modelled.
+        charge_sharing: share of the interactions whose charge is split, at a uniformly distributed
+            ratio, between two cells; each part counts where it exceeds a threshold. 0 switches it
+            off. The correlation that it makes between neighbours is not modelled.
         dead_time_ns: dead time per depth segment after a count; 0 switches pile-up off
             (:mod:`torchpcct.scanner.pileup`).
-        merge_ns: time after a count in which further pulses add to its height, at most the dead time; it shifts counts
-            to higher bins.
+        merge_ns: time after a count in which further pulses add to its height, at most the dead
+            time; it shifts counts to higher bins.
 
     Raises:
         TypeError: a value that is no number.
@@ -136,7 +141,9 @@ class SiliconDetector:
             ("dead_time_ns", 0.0, 1e6, "ns"),
             ("merge_ns", 0.0, self.dead_time_ns, "ns (the dead time)"),
         ):
-            object.__setattr__(self, name, number(name, getattr(self, name), low=low, high=high, unit=unit))
+            object.__setattr__(
+                self, name, number(name, getattr(self, name), low=low, high=high, unit=unit)
+            )
 
     @property
     def bins(self) -> int:
@@ -153,8 +160,11 @@ class SiliconDetector:
         return 0.0
 
     def interaction(self, energies_kev: ArrayLike) -> tuple[Floats, Floats]:
-        """Probability of a (photoelectric, Compton) interaction in the sensitive silicon per incident photon."""
-        photo, compton = (MATERIALS["silicon"].attenuation(energies_kev, kind) for kind in ("photo", "incoh"))
+        """Probability of a (photoelectric, Compton) interaction in the sensitive silicon per
+        incident photon."""
+        photo, compton = (
+            MATERIALS["silicon"].attenuation(energies_kev, kind) for kind in ("photo", "incoh")
+        )
         both = photo + compton
         reached = self.fill_factor * np.exp(-both * self.dead_layer_mm)
         stopped = reached * -np.expm1(-both * self.length_mm) / both
@@ -170,17 +180,19 @@ class SiliconDetector:
         return self._above(energies_kev, thresholds_kev, 0.0)
 
     def photons_above(self, energies_kev: ArrayLike, thresholds_kev: ArrayLike) -> Floats:
-        """Photons that count at least once, per incident photon, arguments as of :meth:`above`: without charge sharing
-        the same; with it a photon may count in two cells, or in none."""
+        """Photons that count at least once, per incident photon, arguments as of :meth:`above`:
+        without charge sharing the same; with it a photon may count in two cells, or in none."""
         return self._above(energies_kev, thresholds_kev, 1.0)
 
     def _above(self, energies_kev: ArrayLike, thresholds_kev: ArrayLike, both: float) -> Floats:
-        """Of a split deposit the chances of both parts to count, less ``both`` times that of both at once."""
+        """Of a split deposit the chances of both parts to count, less ``both`` times that of
+        both at once."""
         energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))
         thresholds = np.atleast_1d(np.asarray(thresholds_kev, dtype=np.float64))
         photo, compton = self.interaction(energies)
         electron, probability = recoil(energies)
-        # All deposits of one photon energy with their probabilities: the photopeak first, then the Compton continuum.
+        # All deposits of one photon energy with their probabilities: the photopeak first, then the
+        # Compton continuum.
         deposit = np.concatenate([energies[:, None], electron], axis=1)
         chance = np.concatenate([photo[:, None], compton[:, None] * probability], axis=1)
         out = np.empty((thresholds.size, energies.size))
@@ -191,7 +203,10 @@ class SiliconDetector:
             if self.charge_sharing:
                 # The nodes are symmetric: reversed, they are those of the other part.
                 one = [ndtr((u * deposit - t) / self.sigma_kev) for u in parts]
-                shared = sum(w * (2.0 * a - both * a * b) for a, b, w in zip(one, one[::-1], weights, strict=True))
+                shared = sum(
+                    w * (2.0 * a - both * a * b)
+                    for a, b, w in zip(one, one[::-1], weights, strict=True)
+                )
                 whole = (1 - self.charge_sharing) * whole + self.charge_sharing * shared
             out[i] = (chance * whole).sum(axis=1)
         return out
@@ -210,15 +225,24 @@ class SiliconDetector:
 
     @functools.cached_property
     def segment_mm(self) -> tuple[float, ...]:
-        """Length of each depth segment in mm, entrance first: equal numbers of interactions at 60 keV."""
-        mu = float(sum(MATERIALS["silicon"].attenuation(SEGMENT_DESIGN_KEV, kind) for kind in ("photo", "incoh")))
+        """Length of each depth segment in mm, entrance first: equal numbers of interactions at
+        60 keV."""
+        mu = float(
+            sum(
+                MATERIALS["silicon"].attenuation(SEGMENT_DESIGN_KEV, kind)
+                for kind in ("photo", "incoh")
+            )
+        )
         stopped = -math.expm1(-mu * self.length_mm)
         ends = [-math.log1p(-stopped * k / self.segments) / mu for k in range(self.segments + 1)]
         return tuple(b - a for a, b in itertools.pairwise(ends))
 
     def segment_shares(self, energies_kev: ArrayLike) -> Floats:
-        """Share of the interactions that falls into each depth segment, ``(segments, E)``, summing to 1."""
-        mu = sum(MATERIALS["silicon"].attenuation(energies_kev, kind) for kind in ("photo", "incoh"))
+        """Share of the interactions that falls into each depth segment, ``(segments, E)``,
+        summing to 1."""
+        mu = sum(
+            MATERIALS["silicon"].attenuation(energies_kev, kind) for kind in ("photo", "incoh")
+        )
         ends = np.concatenate([[0.0], np.cumsum(self.segment_mm)])
         left = np.exp(-np.multiply.outer(ends, mu))
         return np.asarray((left[:-1] - left[1:]) / (1.0 - left[-1]))
@@ -228,14 +252,15 @@ class SiliconDetector:
 class Scintillator:
     """An energy-integrating scintillator: the signal is the absorbed energy in keV.
 
-    Every stopped photon deposits all its energy (K-fluorescence escape and optical gain noise are neglected), so the
-    signal per photon is η E and its second moment η E².
+    Every stopped photon deposits all its energy (K-fluorescence escape and optical gain noise are
+    neglected), so the signal per photon is η E and its second moment η E².
 
     Args:
         material: scintillator (default: the garnet "lumex").
         depth_mm: thickness along the beam.
         fill_factor: sensitive share of the cell's area.
-        electronic_noise_kev: standard deviation of the electronic noise per reading, in keV of absorbed energy.
+        electronic_noise_kev: standard deviation of the electronic noise per reading, in keV of
+            absorbed energy.
 
     Raises:
         ValueError: a value outside its range.
@@ -248,13 +273,17 @@ class Scintillator:
 
     def __post_init__(self) -> None:
         if not isinstance(self.material, Material):
-            raise TypeError(f"material must be a Material, got {self.material!r}: use material('lumex')")
+            raise TypeError(
+                f"material must be a Material, got {self.material!r}: use material('lumex')"
+            )
         for name, low, high, unit in (
             ("depth_mm", 1e-3, 1e3, "mm"),
             ("fill_factor", 1e-6, 1.0, "(a share of the cell)"),
             ("electronic_noise_kev", 0.0, 1e9, "keV"),
         ):
-            object.__setattr__(self, name, number(name, getattr(self, name), low=low, high=high, unit=unit))
+            object.__setattr__(
+                self, name, number(name, getattr(self, name), low=low, high=high, unit=unit)
+            )
 
     @property
     def bins(self) -> int:
@@ -273,7 +302,9 @@ class Scintillator:
     def absorbed(self, energies_kev: ArrayLike) -> Floats:
         """Probability that an incident photon is absorbed, ``(E,)``."""
         energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))
-        return np.asarray(self.fill_factor * -np.expm1(-self.material.attenuation(energies) * self.depth_mm))
+        return np.asarray(
+            self.fill_factor * -np.expm1(-self.material.attenuation(energies) * self.depth_mm)
+        )
 
     def response(self, energies_kev: ArrayLike) -> Floats:
         """Expected absorbed energy in keV per incident photon, ``(1, E)`` float64."""

@@ -1,9 +1,11 @@
-"""Beam-hardening correction that makes water linear: from polychromatic to water-equivalent line integrals.
+"""Beam-hardening correction that makes water linear: from polychromatic to water-equivalent line
+integrals.
 
-A path through t mm of water reads p(t) = −ln(N / N_air) < μ t, because soft photons go first; the bowtie hardens the
-beam differently in every column. Per column, ``mu_ref · t`` is fitted as a polynomial of p (the paper: 5th order over
-10 mm steps up to 380 mm; here a higher order, so that what is left is far below 1 HU). Water then reads 0 HU at
-every radius and in every geometry; other materials keep the small nonlinearity that no water correction removes.
+A path through t mm of water reads p(t) = −ln(N / N_air) < μ t, because soft photons go first; the
+bowtie hardens the beam differently in every column. Per column, ``mu_ref · t`` is fitted as a
+polynomial of p (the paper: 5th order over 10 mm steps up to 380 mm; here a higher order, so that
+what is left is far below 1 HU). Water then reads 0 HU at every radius and in every geometry; other
+materials keep the small nonlinearity that no water correction removes.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ __all__ = ["POLYNOMIAL_UP_TO", "WaterLinearisation"]
 Floats = NDArray[np.float64]
 
 POLYNOMIAL_UP_TO = 12.0
-"""Largest line integral for which a polynomial of :meth:`WaterLinearisation.polynomial` is taken at its word."""
+"""Largest line integral for which a polynomial of :meth:`WaterLinearisation.polynomial` is taken
+at its word."""
 THICKEST_MM = 400.0
 """Of the water in the calibration."""
 _SAMPLES = 400
@@ -37,12 +40,15 @@ class WaterLinearisation:
     """Per-column map from polychromatic line integrals to ``mu_ref`` × water thickness.
 
     Args:
-        coefficients: ``(columns, order)`` float64; ``mu_ref t = p Σ_k coefficients[k] (p / scale)^k``.
-        scale: ``(columns,)`` the largest p of the calibration; the map continues straight beyond it and below 0.
+        coefficients: ``(columns, order)`` float64; ``mu_ref t = p Σ_k coefficients[k] (p /
+            scale)^k``.
+        scale: ``(columns,)`` the largest p of the calibration; the map continues straight beyond it
+            and below 0.
         mu_ref: attenuation in mm⁻¹ that water is given.
 
     Raises:
-        ValueError: tables of other shapes, of no column or no coefficient, NaN or Inf, a scale or ``mu_ref`` ≤ 0.
+        ValueError: tables of other shapes, of no column or no coefficient, NaN or Inf, a scale or
+            ``mu_ref`` ≤ 0.
         TypeError: tables that are not real numbers.
     """
 
@@ -51,37 +57,56 @@ class WaterLinearisation:
     mu_ref: float
 
     def __post_init__(self) -> None:
-        # The kernel reads by index and checks nothing: a table of another shape would be read beyond its end.
+        # The kernel reads by index and checks nothing: a table of another shape would be read
+        # beyond its end.
         coefficients, scale = (
-            np.ascontiguousarray(reals(name, getattr(self, name))) for name in ("coefficients", "scale")
+            np.ascontiguousarray(reals(name, getattr(self, name)))
+            for name in ("coefficients", "scale")
         )
         for name, array in (("coefficients", coefficients), ("scale", scale)):
             if not np.isfinite(array).all():
-                raise ValueError(f"{name} must be finite, {int((~np.isfinite(array)).sum())} entries are NaN or Inf")
-        if coefficients.ndim != 2 or scale.ndim != 1 or coefficients.shape[0] != scale.size or not coefficients.size:
+                raise ValueError(
+                    f"{name} must be finite, {int((~np.isfinite(array)).sum())} entries are NaN "
+                    "or Inf"
+                )
+        if (
+            coefficients.ndim != 2
+            or scale.ndim != 1
+            or coefficients.shape[0] != scale.size
+            or not coefficients.size
+        ):
             raise ValueError(
                 "coefficients must have the shape (columns, order) and scale (columns,), got "
                 f"{coefficients.shape} and {scale.shape}"
             )
         if not (scale > 0).all():
             column = int(np.argmin(scale > 0))
-            raise ValueError(f"scale must be greater than 0 in every column, column {column} has {scale[column]:g}")
+            raise ValueError(
+                f"scale must be greater than 0 in every column, column {column} has "
+                f"{scale[column]:g}"
+            )
         object.__setattr__(self, "coefficients", coefficients)
         object.__setattr__(self, "scale", scale)
-        object.__setattr__(self, "mu_ref", number("mu_ref", self.mu_ref, positive=True, unit="mm⁻¹"))
+        object.__setattr__(
+            self, "mu_ref", number("mu_ref", self.mu_ref, positive=True, unit="mm⁻¹")
+        )
 
     @classmethod
-    def polynomial(cls, coefficients: Sequence[float], columns: int, mu_ref: float) -> WaterLinearisation:
-        """The same polynomial ``c₁ p + c₂ p² + …`` in every column; ``(1.0,)`` leaves the line integrals as they are.
+    def polynomial(
+        cls, coefficients: Sequence[float], columns: int, mu_ref: float
+    ) -> WaterLinearisation:
+        """The same polynomial ``c₁ p + c₂ p² + …`` in every column; ``(1.0,)`` leaves the line
+        integrals as they are.
 
         Args:
-            coefficients: c₁, c₂, … of line integrals p up to :data:`POLYNOMIAL_UP_TO`; beyond it and below 0 the map
-                continues straight.
+            coefficients: c₁, c₂, … of line integrals p up to :data:`POLYNOMIAL_UP_TO`; beyond it
+                and below 0 the map continues straight.
             columns: of the detector.
             mu_ref: attenuation of water in mm⁻¹.
 
         Raises:
-            ValueError, TypeError: no coefficients, values that are not finite numbers, ``mu_ref`` ≤ 0.
+            ValueError, TypeError: no coefficients, values that are not finite numbers, ``mu_ref`` ≤
+                0.
         """
         given = np.array(numbers("coefficients", coefficients))
         scaled = given * POLYNOMIAL_UP_TO ** np.arange(given.size)
@@ -102,7 +127,8 @@ class WaterLinearisation:
             weights: ``(columns, E)`` expected signal per energy without an object.
             mu_water: ``(E,)`` attenuation of water in mm⁻¹.
             order: number of coefficients.
-            shift: what else the detector adds to the line integrals ``(columns, samples)`` that it is given (pile-up).
+            shift: what else the detector adds to the line integrals ``(columns, samples)`` that it
+                is given (pile-up).
 
         Raises:
             ValueError: an order < 1.
@@ -121,15 +147,20 @@ class WaterLinearisation:
         x = p / scale[:, None]
         powers = x[..., None] ** np.arange(order)
         target = mu_ref * t / p
-        coefficients = np.stack([np.linalg.lstsq(a, b, rcond=None)[0] for a, b in zip(powers, target, strict=True)])
+        coefficients = np.stack(
+            [np.linalg.lstsq(a, b, rcond=None)[0] for a, b in zip(powers, target, strict=True)]
+        )
         return cls(coefficients, scale, mu_ref)
 
     def _evaluate(self, p: Tensor, window: DetectorWindow | None, *, slope: bool) -> Tensor:
-        from torchpcct.scanner.linearisation_kernel import evaluate  # numba: presets load without it
+        # numba: presets load without it
+        from torchpcct.scanner.linearisation_kernel import evaluate
 
         columns = self.scale.size if window is None else window.columns
         if p.shape[-1] != columns:
-            raise ValueError(f"p must have {columns} columns on its last axis, got shape {tuple(p.shape)}")
+            raise ValueError(
+                f"p must have {columns} columns on its last axis, got shape {tuple(p.shape)}"
+            )
         if p.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"p must be float32 or float64, got {p.dtype}")
         flat = p.detach().cpu().contiguous().reshape(-1, columns)
@@ -138,27 +169,43 @@ class WaterLinearisation:
         else:
             if tuple(p.shape[-3:-1]) != (window.views, window.rows):
                 raise ValueError(
-                    f"p must have the shape (..., {window.views}, {window.rows}, {columns}) on this window, "
+                    f"p must have the shape (..., {window.views}, {window.rows}, {columns}) on "
+                    "this window, "
                     f"got {tuple(p.shape)}"
                 )
             if int(window.first_column.max()) + columns > self.scale.size:
-                raise ValueError(f"the window reaches beyond the {self.scale.size} columns of the water correction")
+                raise ValueError(
+                    f"the window reaches beyond the {self.scale.size} columns of the water "
+                    "correction"
+                )
             first = np.repeat(window.first_column, window.rows)
         out = torch.empty_like(flat)
         work = flat.shape[1] * 3 * self.coefficients.shape[1]
         terms = np.ascontiguousarray(self.coefficients.T)
-        run(evaluate, len(flat), flat.numpy(), first, terms, self.scale, slope, out.numpy(), operations=work)
+        run(
+            evaluate,
+            len(flat),
+            flat.numpy(),
+            first,
+            terms,
+            self.scale,
+            slope,
+            out.numpy(),
+            operations=work,
+        )
         return out.reshape(p.shape).to(p.device)
 
     def apply(self, p: Tensor, window: DetectorWindow | None = None) -> Tensor:
         """Water-equivalent line integrals ``mu_ref t``.
 
         Args:
-            p: ``(..., columns)`` polychromatic line integrals; with a window ``(..., views, rows, window.columns)``.
+            p: ``(..., columns)`` polychromatic line integrals; with a window ``(..., views, rows,
+                window.columns)``.
             window: the part of the detector that ``p`` holds.
 
         Returns:
-            Tensor of the shape, dtype and device of ``p``. NaN stays NaN. Not differentiable: see :meth:`slope`.
+            Tensor of the shape, dtype and device of ``p``. NaN stays NaN. Not differentiable: see
+                :meth:`slope`.
 
         Raises:
             ValueError: a shape that does not fit the detector or the window.
@@ -178,4 +225,6 @@ class WaterLinearisation:
     @classmethod
     def load(cls, group: Any) -> WaterLinearisation:
         """Read what :meth:`save` wrote."""
-        return cls(group["coefficients"][()], group["scale"][()], float(group.attrs["mu_ref_per_mm"]))
+        return cls(
+            group["coefficients"][()], group["scale"][()], float(group.attrs["mu_ref_per_mm"])
+        )

@@ -12,12 +12,19 @@ __all__ = ["evaluate"]
 
 @njit(nogil=True, cache=True)
 def evaluate(
-    begin: int, end: int, p: Any, first_column: Any, coefficients: Any, scale: Any, slope: bool, out: Any
+    begin: int,
+    end: int,
+    p: Any,
+    first_column: Any,
+    coefficients: Any,
+    scale: Any,
+    slope: bool,
+    out: Any,
 ) -> None:
     """Corrected line integrals (or the slope of the correction) of ``(lines, columns)`` readings.
 
-    Line i starts at detector column ``first_column[i % first_column.size]``; the ``coefficients`` are
-    ``(order, columns)``. Inside 0 … scale a polynomial, beyond both ends straight on.
+    Line i starts at detector column ``first_column[i % first_column.size]``; the ``coefficients``
+    are ``(order, columns)``. Inside 0 … scale a polynomial, beyond both ends straight on.
     """
     columns = p.shape[1]
     x, value, local = np.empty(columns), np.empty(columns), np.empty(columns)

@@ -1,7 +1,8 @@
-"""The two scanners of the plaque study: deep-silicon photon counting (PCCT) and energy integrating (EID-CT).
+"""The two scanners of the plaque study: deep-silicon photon counting (PCCT) and energy integrating
+(EID-CT).
 
-Li et al. publish distances, cell counts, focal spots, tube setting, views and the bowtie. What they leave open is a
-named constant here.
+Li et al. publish distances, cell counts, focal spots, tube setting, views and the bowtie. What they
+leave open is a named constant here.
 """
 
 from __future__ import annotations
@@ -28,12 +29,14 @@ __all__ = [
     "pcct",
 ]
 
-PCCT_VIEWS, EID_VIEWS = 1968, 984
+PCCT_VIEWS = 1968
+EID_VIEWS = 984
 """Published views per turn."""
 
 PCCT_PITCH_MM = (0.50, 0.35)
-"""Inferred (row, column) pitch at the detector: 40 rows of 0.5 mm cover the 11.3 mm that the published volumes hold at
-the isocentre, and "0.4 mm ≈ 2 pixels" at the isocentre gives 0.35 mm columns."""
+"""Inferred (row, column) pitch at the detector: 40 rows of 0.5 mm cover the 11.3 mm that the
+published volumes hold at the isocentre, and "0.4 mm ≈ 2 pixels" at the isocentre gives 0.35 mm
+columns."""
 
 EID_PITCH_MM = (1.0988, 1.0239)
 """(row, column) pitch of the public LightSpeed-VCT configuration."""
@@ -55,7 +58,8 @@ def _bowties(name: Any, sod: float) -> tuple[Bowtie, ...]:
     if not isinstance(name, str):
         if name is not None and not isinstance(name, Sequence):
             raise TypeError(
-                f"bowtie must be one of {', '.join(_BOWTIES)}, a Bowtie or a sequence of them, got {name!r}"
+                f"bowtie must be one of {', '.join(_BOWTIES)}, a Bowtie or a sequence of them, "
+                f"got {name!r}"
             )
         return tuple(name or ())
     choice("bowtie", name, _BOWTIES)
@@ -77,12 +81,14 @@ def pcct(
     detector: SiliconDetector | None = None,
     energy_bin_kev: float = 1.0,
 ) -> Scanner:
-    """Deep-silicon photon-counting CT: 626 / 1098 mm, 40 × 1500 cells of 0.5 × 0.35 mm, 0.5 × 0.5 mm focal spot.
+    """Deep-silicon photon-counting CT: 626 / 1098 mm, 40 × 1500 cells of 0.5 × 0.35 mm, 0.5 × 0.5
+    mm focal spot.
 
     Args:
         views: views per turn.
         mode: ``"counting"`` (sum of all bins) or ``"spectral"`` (8 energy bins).
-        bowtie: ``"large"``, ``"roi"``, ``"large+roi"``, ``"none"``, a :class:`Bowtie` or a sequence of them.
+        bowtie: ``"large"``, ``"roi"``, ``"large+roi"``, ``"none"``, a :class:`Bowtie` or a sequence
+            of them.
         kvp, current_ma: tube setting.
         rows, columns: detector cells.
         quarter_offset: shift the detector by a quarter column, so that opposite views interleave.
@@ -94,7 +100,14 @@ def pcct(
     """
     offset = QUARTER_OFFSET_COLUMNS * PCCT_PITCH_MM[1] if quarter_offset else 0.0
     geometry = ConeBeam(
-        full_turn(views), 626.0, 1098.0, columns, rows, PCCT_PITCH_MM, offset=(0.0, offset), detector="curved"
+        full_turn(views),
+        626.0,
+        1098.0,
+        columns,
+        rows,
+        PCCT_PITCH_MM,
+        offset=(0.0, offset),
+        detector="curved",
     )
     return Scanner(
         "PCCT",
@@ -119,7 +132,8 @@ def eid(
     detector: Scintillator | None = None,
     energy_bin_kev: float = 1.0,
 ) -> Scanner:
-    """Energy-integrating CT like the LightSpeed VCT: 541 / 949 mm, 64 × 888 cells of 1.10 × 1.02 mm, 0.9 × 0.7 mm spot.
+    """Energy-integrating CT like the LightSpeed VCT: 541 / 949 mm, 64 × 888 cells of 1.10 × 1.02
+    mm, 0.9 × 0.7 mm spot.
 
     Args:
         views: views per turn.
@@ -131,7 +145,14 @@ def eid(
     """
     offset = EID_OFFSET_COLUMNS * EID_PITCH_MM[1]
     geometry = ConeBeam(
-        full_turn(views), 541.0, 949.0, columns, rows, EID_PITCH_MM, offset=(0.0, offset), detector="curved"
+        full_turn(views),
+        541.0,
+        949.0,
+        columns,
+        rows,
+        EID_PITCH_MM,
+        offset=(0.0, offset),
+        detector="curved",
     )
     return Scanner(
         "EID-CT",

@@ -1,4 +1,5 @@
-"""A scanner: geometry, tube, filters, bowties and detector, and the photons and signals that follow from them."""
+"""A scanner: geometry, tube, filters, bowties and detector, and the photons and signals that
+follow from them."""
 
 from __future__ import annotations
 
@@ -33,7 +34,8 @@ class Scanner:
         geometry: cone beam with the view angles of one turn.
         source: the tube.
         detector: counting or energy integrating (:mod:`torchpcct.scanner.detector`).
-        filters: flat slabs in front of the tube, ``((material, mm), …)``; a ray at fan angle γ crosses mm / cos γ.
+        filters: flat slabs in front of the tube, ``((material, mm), …)``; a ray at fan angle γ
+            crosses mm / cos γ.
         bowties: one bowtie or a sequence of them, one behind the other.
         energy_bin_kev: width of the energy bins of the simulation in keV, 0.1…5.
 
@@ -51,10 +53,16 @@ class Scanner:
     energy_bin_kev: float = 1.0
 
     def __post_init__(self) -> None:
-        for field_name, kind in (("geometry", ConeBeam), ("source", Source), ("detector", Detector)):
+        for field_name, kind in (
+            ("geometry", ConeBeam),
+            ("source", Source),
+            ("detector", Detector),
+        ):
             value = getattr(self, field_name)
             if not isinstance(value, kind):
-                raise TypeError(f"{field_name} must be a {kind.__name__}, got {type(value).__name__}")
+                raise TypeError(
+                    f"{field_name} must be a {kind.__name__}, got {type(value).__name__}"
+                )
         bowties: Any = self.bowties
         bowties = (bowties,) if isinstance(bowties, Bowtie) else tuple(bowties or ())
         if not all(isinstance(b, Bowtie) for b in bowties):
@@ -74,10 +82,12 @@ class Scanner:
         return replace(self, geometry=replace(self.geometry, angles=angles))
 
     def quanta(self) -> tuple[Floats, Floats]:
-        """Photons that reach a cell of the central plane (z = 0) in air, per reading and mAs of tube load.
+        """Photons that reach a cell of the central plane (z = 0) in air, per reading and mAs of
+        tube load.
 
-        Fluence behind inherent filtration × inverse square of the distance source–cell × cell area seen by the beam ×
-        transmission of flat filters (oblique path) and bowties. Air itself is not in the way.
+        Fluence behind inherent filtration × inverse square of the distance source–cell × cell area
+        seen by the beam × transmission of flat filters (oblique path) and bowties. Air itself is
+        not in the way.
 
         Returns:
             ``energies`` (E,) keV and ``photons`` (columns, E), float64, read-only, cached.
@@ -88,13 +98,15 @@ class Scanner:
         """Expected signal in air per reading and mAs, by the energy of the photons that make it.
 
         Returns:
-            ``energies`` (E,) keV and ``weights`` (bins, columns, E) in counts or keV, float64, read-only, cached:
-            quanta × detector response. Their sum over E is the air reading per mAs.
+            ``energies`` (E,) keV and ``weights`` (bins, columns, E) in counts or keV, float64,
+            read-only, cached: quanta × detector response. Their sum over E is the air reading per
+            mAs.
         """
         return _weights(_Optics.of(self), self.detector, False)
 
     def noise_weights(self) -> tuple[Floats, Floats]:
-        """As :meth:`weights`, for the variance of a reading: quanta × second moment of the detector's signal.
+        """As :meth:`weights`, for the variance of a reading: quanta × second moment of the
+        detector's signal.
 
         The electronic noise ``detector.electronic_noise**2`` comes on top.
         """
@@ -102,7 +114,8 @@ class Scanner:
 
     @property
     def row_factor(self) -> Floats:
-        """Quanta of each row relative to the central plane, ``(rows,)``: inverse square and obliquity.
+        """Quanta of each row relative to the central plane, ``(rows,)``: inverse square and
+        obliquity.
 
         The longer path through the filters, below 1e-4 at 1° of cone angle, is left out.
         """
@@ -115,35 +128,44 @@ class Scanner:
         Raises:
             ValueError: ``exposure_s`` ≤ 0 or not finite.
         """
-        return self.source.current_ma * number("exposure_s", exposure_s, positive=True, unit="s") / self.geometry.views
+        return (
+            self.source.current_ma
+            * number("exposure_s", exposure_s, positive=True, unit="s")
+            / self.geometry.views
+        )
 
     def pile_up(self) -> PileUpMap | None:
-        """What pile-up makes of the expected readings at the tube's current, cached; None without a dead time.
+        """What pile-up makes of the expected readings at the tube's current, cached; None without a
+        dead time.
 
-        Only what stands before the patient, the detector and the current matter, not the number of views.
+        Only what stands before the patient, the detector and the current matter, not the number of
+        views.
         """
         if isinstance(self.detector, SiliconDetector) and self.detector.dead_time_ns:
             return _pile_up(_Optics.of(self), self.detector)
         return None
 
     def behind(self, paths: Mapping[Material, float]) -> Floats:
-        """:meth:`weights` behind homogeneous slabs, material → path in mm: ``(bins, columns, E)``."""
+        """:meth:`weights` behind homogeneous slabs, material → path in mm: ``(bins, columns,
+        E)``."""
         energies, weights = self.weights()
         depth = sum(m.attenuation(energies) * float(t) for m, t in paths.items()) if paths else 0.0
         return np.asarray(weights * np.exp(-depth))
 
     def water_linearisation(self) -> WaterLinearisation:
-        """Beam-hardening correction that makes water linear, one polynomial per column; within 2e-5 of the path.
+        """Beam-hardening correction that makes water linear, one polynomial per column; within 2e-5
+        of the path.
 
-        Of the sum of all energy bins, and calibrated on what the detector records: pile-up, if the detector has a dead
-        time, is part of the curve.
+        Of the sum of all energy bins, and calibrated on what the detector records: pile-up, if the
+        detector has a dead time, is part of the curve.
         """
         return _linearisation(_Optics.of(self), self.detector, self.pile_up())
 
 
 @dataclass(frozen=True)
 class _Optics:
-    """What the quanta depend on; not on the views, so that scanners with other views share the cache."""
+    """What the quanta depend on; not on the views, so that scanners with other views share the
+    cache."""
 
     geometry: ConeBeam
     source: Source
@@ -154,7 +176,9 @@ class _Optics:
     @classmethod
     def of(cls, scanner: Scanner) -> _Optics:
         geometry = replace(scanner.geometry, angles=(0.0,))
-        return cls(geometry, scanner.source, scanner.filters, scanner.bowties, scanner.energy_bin_kev)
+        return cls(
+            geometry, scanner.source, scanner.filters, scanner.bowties, scanner.energy_bin_kev
+        )
 
 
 @functools.lru_cache(maxsize=8)
@@ -183,12 +207,17 @@ def _weights(optics: _Optics, detector: Detector, squared: bool) -> tuple[Floats
 @functools.lru_cache(maxsize=4)
 def _pile_up(optics: _Optics, detector: SiliconDetector) -> PileUpMap:
     energies, quanta = _quanta(optics)
-    return PileUpMap.calibrate(detector, energies, quanta * optics.source.current_ma)  # per mA·s times mA
+    # per mA·s times mA
+    return PileUpMap.calibrate(detector, energies, quanta * optics.source.current_ma)
 
 
 @functools.lru_cache(maxsize=16)
-def _linearisation(optics: _Optics, detector: Detector, pile_up: PileUpMap | None) -> WaterLinearisation:
+def _linearisation(
+    optics: _Optics, detector: Detector, pile_up: PileUpMap | None
+) -> WaterLinearisation:
     energies, weights = _weights(optics, detector, False)
     order = 7 if pile_up is None else 15  # coefficients per column: pile-up bends the curve more
     shift = None if pile_up is None else pile_up.shift
-    return WaterLinearisation.calibrate(weights.sum(0), MATERIALS["water"].attenuation(energies), order, shift)
+    return WaterLinearisation.calibrate(
+        weights.sum(0), MATERIALS["water"].attenuation(energies), order, shift
+    )

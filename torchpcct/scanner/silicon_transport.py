@@ -1,11 +1,13 @@
-"""Photons followed through an edge-on silicon detector: what the one-interaction response leaves out.
+"""Photons followed through an edge-on silicon detector: what the one-interaction response leaves
+out.
 
-A Compton-scattered photon may interact again, in another strip or depth segment, and count twice; a tungsten foil may
-stop it. Counting some photons twice adds noise: with k counts per incident photon, the zero-frequency detective quantum
-efficiency of the counts is E[k]² / E[k²] (Rabbani, Shaw and Van Metter, J. Opt. Soc. Am. A 4, 895, 1987), not the share
-of photons that count. This module follows photons one by one to find out. It is a reference for
-:class:`~torchpcct.scanner.detector.SiliconDetector`, which lets a photon interact once; :class:`TransportedSilicon`
-brings it into scans.
+A Compton-scattered photon may interact again, in another strip or depth segment, and count twice; a
+tungsten foil may stop it. Counting some photons twice adds noise: with k counts per incident
+photon, the zero-frequency detective quantum efficiency of the counts is E[k]² / E[k²] (Rabbani,
+Shaw and Van Metter, J. Opt. Soc. Am. A 4, 895, 1987), not the share of photons that count. This
+module follows photons one by one to find out. It is a reference for
+:class:`~torchpcct.scanner.detector.SiliconDetector`, which lets a photon interact once;
+:class:`TransportedSilicon` brings it into scans.
 """
 
 from __future__ import annotations
@@ -40,7 +42,8 @@ _HEIGHTS = np.arange(0.5 * _HEIGHT_KEV, _NODES_KEV[-1] + 1.0, _HEIGHT_KEV)
 
 @dataclass(frozen=True)
 class Stack:
-    """Silicon sheets side by side, tungsten foils between them; strips within a sheet have no foil between them.
+    """Silicon sheets side by side, tungsten foils between them; strips within a sheet have no foil
+    between them.
 
     Args:
         sheet_pitch_mm: from one sheet to the next (foil included).
@@ -58,7 +61,13 @@ class Stack:
     def __post_init__(self) -> None:
         number("sheet_pitch_mm", self.sheet_pitch_mm, low=1e-3, high=1e3, unit="mm")
         number("strip_pitch_mm", self.strip_pitch_mm, low=1e-3, high=1e3, unit="mm")
-        number("foil_mm", self.foil_mm, low=0.0, high=0.99 * self.sheet_pitch_mm, unit="mm (less than the pitch)")
+        number(
+            "foil_mm",
+            self.foil_mm,
+            low=0.0,
+            high=0.99 * self.sheet_pitch_mm,
+            unit="mm (less than the pitch)",
+        )
 
 
 @dataclass(frozen=True)
@@ -68,7 +77,8 @@ class Deposits:
     Attributes:
         incident_kev: ``(photons,)`` energies of the incident photons.
         photon: ``(N,)`` index of the incident photon of each deposit.
-        sheet, strip, segment: ``(N,)`` where, sheet and strip counted from the cell that the photon was aimed at.
+        sheet, strip, segment: ``(N,)`` where, sheet and strip counted from the cell that the photon
+            was aimed at.
         energy_kev: ``(N,)``.
         order: ``(N,)`` 0 for a photon's first interaction, 1 for its second …
     """
@@ -87,7 +97,8 @@ class Deposits:
         return self.incident_kev.size
 
     def pulses(self) -> tuple[Ints, Floats]:
-        """Incident photon and height in keV of every pulse: of all that one photon left in one segment of a strip."""
+        """Incident photon and height in keV of every pulse: of all that one photon left in one
+        segment of a strip."""
         keys = np.stack([self.photon, self.sheet, self.strip, self.segment], axis=1)
         places, index = np.unique(keys, axis=0, return_inverse=True)
         return places[:, 0], np.bincount(index.reshape(-1), self.energy_kev).astype(np.float64)
@@ -107,7 +118,8 @@ class Deposits:
             threshold_kev: a pulse counts above it.
             sigma_kev: standard deviation of a pulse's height.
             rng: of the heights' noise.
-            charge_sharing: share of the pulses that split, at a uniformly distributed ratio, between two cells.
+            charge_sharing: share of the pulses that split, at a uniformly distributed ratio,
+                between two cells.
         """
         owner, heights = self.pulses()
         if charge_sharing:
@@ -130,12 +142,13 @@ def follow(
 ) -> Deposits:
     """Follow photons that enter the front of the detector along the strips, evenly over one cell.
 
-    Photoelectric absorption leaves all energy where it happens; Compton scattering follows Klein and Nishina for free
-    electrons; coherent scatter is left out. What a foil absorbs or scatters is lost (fluorescence of tungsten needs
-    more than 69.5 keV and is left out).
+    Photoelectric absorption leaves all energy where it happens; Compton scattering follows Klein
+    and Nishina for free electrons; coherent scatter is left out. What a foil absorbs or scatters is
+    lost (fluorescence of tungsten needs more than 69.5 keV and is left out).
 
     Args:
-        detector: its length, dead layer and segments; its ``fill_factor`` is replaced by the foils of ``stack``.
+        detector: its length, dead layer and segments; its ``fill_factor`` is replaced by the foils
+            of ``stack``.
         energies_kev, weights: ``(E,)`` spectrum of the incident photons.
         photons: number of incident photons.
         rng: of all random numbers.
@@ -149,9 +162,12 @@ def follow(
     chance = np.asarray(weights, dtype=np.float64)
     if not (np.isfinite(chance).all() and (chance >= 0).all() and chance.sum() > 0):
         raise ValueError("weights must be finite, ≥ 0 and not all 0")
-    incident = rng.choice(np.atleast_1d(np.asarray(energies_kev, dtype=np.float64)), photons, p=chance / chance.sum())
+    incident = rng.choice(
+        np.atleast_1d(np.asarray(energies_kev, dtype=np.float64)), photons, p=chance / chance.sum()
+    )
     energy, index = incident, np.arange(photons)
-    # x along the sheet, y across the sheets (a sheet fills 0 … pitch − foil of its period), z depth.
+    # x along the sheet, y across the sheets (a sheet fills 0 … pitch − foil of its period), z
+    # depth.
     place = np.zeros((photons, 3))
     place[:, 0] = rng.uniform(0.0, stack.strip_pitch_mm, photons)
     place[:, 1] = rng.uniform(0.0, stack.sheet_pitch_mm, photons)
@@ -162,9 +178,19 @@ def follow(
     table = _Attenuation()
     found: list[tuple[Any, ...]] = []
     for order in range(_MOST_INTERACTIONS):
-        index, place, direction, energy = index[alive], place[alive], direction[alive], energy[alive]
+        index, place, direction, energy = (
+            index[alive],
+            place[alive],
+            direction[alive],
+            energy[alive],
+        )
         place, alive = _fly(place, direction, energy, stack, float(ends[-1]), table, rng)
-        index, place, direction, energy = index[alive], place[alive], direction[alive], energy[alive]
+        index, place, direction, energy = (
+            index[alive],
+            place[alive],
+            direction[alive],
+            energy[alive],
+        )
         absorbed = rng.random(index.size) < table.photo_share(energy)
         scattered, cosine = _scatter(energy, rng)
         left = np.where(absorbed, energy, energy - scattered)
@@ -172,23 +198,29 @@ def follow(
         sheet = np.floor(place[:, 1] / stack.sheet_pitch_mm).astype(np.int64)
         strip = np.floor(place[:, 0] / stack.strip_pitch_mm).astype(np.int64)
         segment = np.minimum(np.searchsorted(ends, place[:, 2]), ends.size - 1)
-        found.append(tuple(a[seen] for a in (index, sheet, strip, segment, left, np.full(index.size, order))))
+        found.append(
+            tuple(a[seen] for a in (index, sheet, strip, segment, left, np.full(index.size, order)))
+        )
         if index.size == 0:
             break
         direction = _turn(direction, cosine, rng.uniform(0.0, 2.0 * np.pi, index.size))
         energy, alive = scattered, ~absorbed
-    photon, sheet, strip, segment, left, orders = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    photon, sheet, strip, segment, left, orders = (
+        np.concatenate(parts) for parts in zip(*found, strict=True)
+    )
     return Deposits(incident, photon, sheet, strip, segment, left, orders)
 
 
 @checked
 def efficiency(counts: ArrayLike, task: ArrayLike | None = None) -> tuple[float, float]:
-    """Zero-frequency DQE of counts against an ideal energy-resolving detector, and its standard error.
+    """Zero-frequency DQE of counts against an ideal energy-resolving detector, and its standard
+    error.
 
     Args:
         counts: ``(photons,)`` counts k of every incident photon.
-        task: ``(photons,)`` relative change g of the photon's probability by what is to be detected: its attenuation
-            coefficient for a change of thickness or density. None: the same for all, E[k]² / E[k²].
+        task: ``(photons,)`` relative change g of the photon's probability by what is to be
+            detected: its attenuation coefficient for a change of thickness or density. None: the
+            same for all, E[k]² / E[k²].
 
     Returns:
         ``E[g k]² / (E[k²] E[g²])`` and its standard error.
@@ -216,7 +248,9 @@ class _Attenuation:
         silicon, tungsten = MATERIALS["silicon"], MATERIALS["tungsten"]
         self.photo = silicon.attenuation(self.grid, "photo")
         self.both = self.photo + silicon.attenuation(self.grid, "incoh")
-        self.foil = tungsten.attenuation(self.grid, "photo") + tungsten.attenuation(self.grid, "incoh")
+        self.foil = tungsten.attenuation(self.grid, "photo") + tungsten.attenuation(
+            self.grid, "incoh"
+        )
 
     def photo_share(self, energy: Floats) -> Floats:
         return np.interp(energy, self.grid, self.photo / self.both)
@@ -229,7 +263,13 @@ class _Attenuation:
 
 
 def _fly(
-    place: Floats, direction: Floats, energy: Floats, stack: Stack, depth: float, table: _Attenuation, rng: Any
+    place: Floats,
+    direction: Floats,
+    energy: Floats,
+    stack: Stack,
+    depth: float,
+    table: _Attenuation,
+    rng: Any,
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """To the next interaction in silicon: places, and whether there is one."""
     place = place.copy()
@@ -244,11 +284,15 @@ def _fly(
             return place, done
         p, d = place[on], direction[on]
         period = np.floor(p[:, 1] / stack.sheet_pitch_mm)
-        wall = np.where(d[:, 1] > 0, period * stack.sheet_pitch_mm + silicon, period * stack.sheet_pitch_mm)
+        wall = np.where(
+            d[:, 1] > 0, period * stack.sheet_pitch_mm + silicon, period * stack.sheet_pitch_mm
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
             to_wall = np.where(d[:, 1] == 0, np.inf, (wall - p[:, 1]) / d[:, 1])
             to_end = np.where(
-                d[:, 2] > 0, (depth - p[:, 2]) / d[:, 2], np.where(d[:, 2] < 0, -p[:, 2] / d[:, 2], np.inf)
+                d[:, 2] > 0,
+                (depth - p[:, 2]) / d[:, 2],
+                np.where(d[:, 2] < 0, -p[:, 2] / d[:, 2], np.inf),
             )
         to_wall, to_end = np.maximum(to_wall, 0.0), np.maximum(to_end, 0.0)
         step = np.minimum(np.minimum(to_wall, to_end), free[on])
@@ -292,7 +336,9 @@ def _turn(direction: Floats, cosine: Floats, azimuth: Floats) -> Floats:
     a /= np.linalg.norm(a, axis=1, keepdims=True)
     b = np.cross(direction, a)
     sine = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))
-    out = cosine[:, None] * direction + sine[:, None] * (np.cos(azimuth)[:, None] * a + np.sin(azimuth)[:, None] * b)
+    out = cosine[:, None] * direction + sine[:, None] * (
+        np.cos(azimuth)[:, None] * a + np.sin(azimuth)[:, None] * b
+    )
     return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
 
 
@@ -300,17 +346,20 @@ def _turn(direction: Floats, cosine: Floats, azimuth: Floats) -> Floats:
 class TransportedSilicon(SiliconDetector):
     """Edge-on silicon whose photons are followed through all interactions.
 
-    What a photon leaves in other cells is counted as if in its own: right where neighbouring cells see the same
-    intensity; the blur and the correlation between neighbours are not modelled. Counts stay Poisson here; the noise
-    that counting a photon twice adds is in :func:`torchpcct.scanner.silicon_transport.efficiency`.
+    What a photon leaves in other cells is counted as if in its own: right where neighbouring cells
+    see the same intensity; the blur and the correlation between neighbours are not modelled. Counts
+    stay Poisson here; the noise that counting a photon twice adds is in
+    :func:`torchpcct.scanner.silicon_transport.efficiency`.
 
     Args:
         photons: number of photons followed, evenly over energies of 10…150 keV.
         transport_seed: of them.
-        stack: sheets and foils; ``fill_factor`` must be the share of the pitch that the foils leave.
+        stack: sheets and foils; ``fill_factor`` must be the share of the pitch that the foils
+            leave.
 
     Raises:
-        ValueError: ``fill_factor`` that contradicts the foils; charge sharing or pile-up, which are not followed.
+        ValueError: ``fill_factor`` that contradicts the foils; charge sharing or pile-up, which are
+            not followed.
     """
 
     photons: int = 1_000_000
@@ -325,25 +374,35 @@ class TransportedSilicon(SiliconDetector):
         whole("transport_seed", self.transport_seed, 0)
         share = 1.0 - self.stack.foil_mm / self.stack.sheet_pitch_mm
         if abs(share - self.fill_factor) > 1e-6:
-            raise ValueError(f"fill_factor must be {share:g}, what the stack's foils leave, got {self.fill_factor:g}")
+            raise ValueError(
+                f"fill_factor must be {share:g}, what the stack's foils leave, got "
+                f"{self.fill_factor:g}"
+            )
         if self.charge_sharing or self.dead_time_ns:
-            raise ValueError("followed photons know neither charge sharing nor pile-up: leave both at 0")
+            raise ValueError(
+                "followed photons know neither charge sharing nor pile-up: leave both at 0"
+            )
 
     def above(self, energies_kev: ArrayLike, thresholds_kev: ArrayLike) -> Floats:
-        """Expected counts above thresholds per incident photon, ``(thresholds, E)``, with all interactions."""
+        """Expected counts above thresholds per incident photon, ``(thresholds, E)``, with all
+        interactions."""
         thresholds = np.atleast_1d(np.asarray(thresholds_kev, dtype=np.float64))
         energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))
         # Bins, blur and mode do not change what is followed: they share the cache.
         more = _further(replace(self, mode="counting", thresholds_kev=(5.0,), sigma_kev=1.0))
         counted = more @ ndtr((_HEIGHTS[:, None] - thresholds) / self.sigma_kev)
-        return super().above(energies, thresholds) + np.stack([np.interp(energies, _NODES_KEV, c) for c in counted.T])
+        return super().above(energies, thresholds) + np.stack(
+            [np.interp(energies, _NODES_KEV, c) for c in counted.T]
+        )
 
 
 @functools.lru_cache(maxsize=4)
 def _further(detector: TransportedSilicon) -> Floats:
     """Pulses per photon of all interactions less those of the first alone, ``(nodes, heights)``."""
     rng = np.random.default_rng(detector.transport_seed)
-    d = follow(detector, _NODES_KEV, np.ones(_NODES_KEV.size), detector.photons, rng, detector.stack)
+    d = follow(
+        detector, _NODES_KEV, np.ones(_NODES_KEV.size), detector.photons, rng, detector.stack
+    )
     node = np.searchsorted(_NODES_KEV, d.incident_kev)
     first = d.order == 0
     shape = (_NODES_KEV.size, _HEIGHTS.size)

@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 from torchpcct.scene.materials import MATERIALS, Material
 from torchpcct.validate import number, numbers, reals
 
-__all__ = ["ANODE_ANGLE_DEG", "INHERENT_ALUMINIUM_MM", "TUBE_OUTPUT", "Slabs", "Source", "Spectrum", "slabs"]
+__all__ = [
+    "ANODE_ANGLE_DEG",
+    "INHERENT_ALUMINIUM_MM",
+    "TUBE_OUTPUT",
+    "Slabs",
+    "Source",
+    "Spectrum",
+    "slabs",
+]
 
 Floats = NDArray[np.float64]
 Slabs = tuple[tuple[Material, float], ...]
@@ -24,12 +32,14 @@ INHERENT_ALUMINIUM_MM = 2.5
 """Assumed inherent filtration of tube, window and oil, as aluminium."""
 
 TUBE_OUTPUT = 0.555
-"""Assumed photon output relative to spekpy's ideal target. Chosen so that a deep-silicon reading in air agrees within
-2 % with that computed from the 100 kVp, 7° spectrum table of the public CatSim/XCIST simulator, which the plaque study
-used: real anodes are rough and give less than the ideal one."""
+"""Assumed photon output relative to spekpy's ideal target. Chosen so that a deep-silicon reading in
+air agrees within 2 % with that computed from the 100 kVp, 7° spectrum table of the public
+CatSim/XCIST simulator, which the plaque study used: real anodes are rough and give less than the
+ideal one."""
 
 _NEGLIGIBLE = 1e-6
-"""Bins are dropped at both ends of the spectrum where together they hold less than this share of the photons."""
+"""Bins are dropped at both ends of the spectrum where together they hold less than this share of
+the photons."""
 
 
 def slabs(name: str, value: Any) -> Slabs:
@@ -42,10 +52,14 @@ def slabs(name: str, value: Any) -> Slabs:
     try:
         pairs = tuple((m, float(t)) for m, t in value)
     except (TypeError, ValueError):
-        raise TypeError(f"{name} must be a sequence of (material, thickness in mm) pairs, got {value!r}") from None
+        raise TypeError(
+            f"{name} must be a sequence of (material, thickness in mm) pairs, got {value!r}"
+        ) from None
     for m, t in pairs:
         if not isinstance(m, Material):
-            raise TypeError(f"{name} must hold (Material, mm) pairs, got {m!r}: use material('aluminium')")
+            raise TypeError(
+                f"{name} must hold (Material, mm) pairs, got {m!r}: use material('aluminium')"
+            )
         number(f"{name}: thickness of {m.name}", t, low=0.0, unit="mm")
     return pairs
 
@@ -77,23 +91,25 @@ class Spectrum:
 class Source:
     """A tungsten-anode tube.
 
-    The spectrum is spekpy's (Poludniowski et al. 2021, Casnati/NIST bremsstrahlung and characteristic model "casim")
-    behind ``filtration``, times ``output``. The heel effect and off-focal radiation are not modelled.
+    The spectrum is spekpy's (Poludniowski et al. 2021, Casnati/NIST bremsstrahlung and
+    characteristic model "casim") behind ``filtration``, times ``output``. The heel effect and
+    off-focal radiation are not modelled.
 
     Args:
         kvp: tube voltage in kV, 20…150.
         current_ma: tube current in mA.
-        focal_spot: ``(width, length)`` in mm: width across the fan (along the columns), length along z as seen from
-            the isocentre. ``(0, 0)`` is a point.
+        focal_spot: ``(width, length)`` in mm: width across the fan (along the columns), length
+            along z as seen from the isocentre. ``(0, 0)`` is a point.
         anode_angle_deg: anode angle in degrees, 3…45.
         filtration: inherent filtration of the tube, ``((material, mm), …)``.
         output: photon output relative to spekpy's ideal target, or to ``table``.
-        table: a measured or tabulated spectrum instead of spekpy's, ``(energies in keV, photons / mm² / mAs at 1 m)``,
-            already behind ``filtration``; see :meth:`tabulated`.
+        table: a measured or tabulated spectrum instead of spekpy's, ``(energies in keV, photons /
+            mm² / mAs at 1 m)``, already behind ``filtration``; see :meth:`tabulated`.
 
     Raises:
-        ValueError: a value outside its range, a focal spot that is not two numbers; no filtration at all (unfiltered
-            spectra are dominated by photons below 10 keV, which no patient beam contains).
+        ValueError: a value outside its range, a focal spot that is not two numbers; no filtration
+            at all (unfiltered spectra are dominated by photons below 10 keV, which no patient beam
+            contains).
         TypeError: filtration of the wrong form, a value that is no number.
     """
 
@@ -101,22 +117,34 @@ class Source:
     current_ma: float = 1000.0
     focal_spot: tuple[float, float] = (0.5, 0.5)
     anode_angle_deg: float = ANODE_ANGLE_DEG
-    filtration: Slabs = field(default_factory=lambda: ((MATERIALS["aluminium"], INHERENT_ALUMINIUM_MM),))
+    filtration: Slabs = field(
+        default_factory=lambda: ((MATERIALS["aluminium"], INHERENT_ALUMINIUM_MM),)
+    )
     output: float = TUBE_OUTPUT
     table: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
         set_(self, "kvp", number("kvp", self.kvp, low=20.0, high=150.0, unit="kV"))
-        set_(self, "anode_angle_deg", number("anode_angle_deg", self.anode_angle_deg, low=3.0, high=45.0, unit="°"))
+        set_(
+            self,
+            "anode_angle_deg",
+            number("anode_angle_deg", self.anode_angle_deg, low=3.0, high=45.0, unit="°"),
+        )
         set_(self, "current_ma", number("current_ma", self.current_ma, positive=True, unit="mA"))
-        set_(self, "output", number("output", self.output, positive=True, unit="times spekpy's output"))
+        set_(
+            self,
+            "output",
+            number("output", self.output, positive=True, unit="times spekpy's output"),
+        )
         set_(self, "focal_spot", numbers("focal_spot", self.focal_spot, 2, low=0.0, unit="mm"))
         set_(self, "filtration", slabs("filtration", self.filtration))
         if self.table is not None:
             set_(self, "table", _table(self.table))
         elif not any(t > 0 for _, t in self.filtration):
-            raise ValueError("filtration must not be empty: a tube has at least about 2 mm aluminium equivalent")
+            raise ValueError(
+                "filtration must not be empty: a tube has at least about 2 mm aluminium equivalent"
+            )
 
     @classmethod
     def tabulated(cls, energies_kev: Any, fluence: Any, **changes: Any) -> Source:
@@ -124,15 +152,25 @@ class Source:
 
         Args:
             energies_kev: ``(E,)`` energies in keV, increasing.
-            fluence: ``(E,)`` photons per entry, mm² and mAs at 1 m, behind the tube's inherent filtration.
+            fluence: ``(E,)`` photons per entry, mm² and mAs at 1 m, behind the tube's inherent
+                filtration.
             changes: other fields; ``output`` is 1, ``kvp`` the highest energy unless given.
 
         Raises:
-            ValueError: tables of different lengths, energies that do not increase, negative or no photons.
+            ValueError: tables of different lengths, energies that do not increase, negative or no
+                photons.
         """
         energies = tuple(float(v) for v in energies_kev)
         table = (energies, tuple(float(v) for v in fluence))
-        return cls(**{"kvp": max(energies, default=0.0), "output": 1.0, "filtration": (), "table": table, **changes})
+        return cls(
+            **{
+                "kvp": max(energies, default=0.0),
+                "output": 1.0,
+                "filtration": (),
+                "table": table,
+                **changes,
+            }
+        )
 
     def spectrum(self, bin_kev: float = 1.0) -> Spectrum:
         """Photons / mm² / mAs at 1 m behind the tube's inherent filtration.
@@ -141,7 +179,8 @@ class Source:
             bin_kev: bin width in keV, 0.1…5.
 
         Returns:
-            :class:`Spectrum`; the negligible bins at its ends are left out. Cached: spekpy takes a second.
+            :class:`Spectrum`; the negligible bins at its ends are left out. Cached: spekpy takes a
+            second.
 
         Raises:
             ValueError: ``bin_kev`` out of range.
@@ -157,7 +196,10 @@ def _table(value: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
         raise TypeError(f"table must be a pair, energies in keV and fluences, got {value!r:.60}")
     energies, fluence = (reals("table", v) for v in value)
     if energies.ndim != 1 or energies.shape != fluence.shape or energies.size == 0:
-        raise ValueError(f"table must hold as many fluences as energies, got {energies.shape} and {fluence.shape}")
+        raise ValueError(
+            f"table must hold as many fluences as energies, got {energies.shape} and "
+            f"{fluence.shape}"
+        )
     if not (np.isfinite(energies).all() and energies[0] > 0 and (np.diff(energies) > 0).all()):
         raise ValueError("table energies must be finite, > 0 keV and strictly increasing")
     if not (np.isfinite(fluence).all() and (fluence >= 0).all() and fluence.sum() > 0):
@@ -166,15 +208,19 @@ def _table(value: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 @functools.lru_cache(maxsize=8)
-def _rebinned(table: tuple[tuple[float, ...], tuple[float, ...]], output: float, bin_kev: float) -> Spectrum:
+def _rebinned(
+    table: tuple[tuple[float, ...], tuple[float, ...]], output: float, bin_kev: float
+) -> Spectrum:
     energies, fluence = np.array(table[0]), output * np.array(table[1])
-    # Photon number and energy are kept: a bin stands at the mean energy of its photons. An energy on an edge (up to
-    # round-off) belongs to the upper bin.
+    # Photon number and energy are kept: a bin stands at the mean energy of its photons. An energy
+    # on an edge (up to round-off) belongs to the upper bin.
     index = np.floor(energies / bin_kev + 1e-9).astype(np.int64)
     index -= index[0]
     photons: Floats = np.bincount(index, fluence).astype(np.float64)
     filled = photons > 0
-    return _trimmed(np.bincount(index, fluence * energies)[filled] / photons[filled], photons[filled])
+    return _trimmed(
+        np.bincount(index, fluence * energies)[filled] / photons[filled], photons[filled]
+    )
 
 
 @functools.lru_cache(maxsize=32)
@@ -188,7 +234,9 @@ def _bare_tube(kvp: float, anode_angle_deg: float, bin_kev: float) -> tuple[Floa
 
 
 @functools.lru_cache(maxsize=32)
-def _spectrum(kvp: float, angle: float, filtration: Slabs, output: float, bin_kev: float) -> Spectrum:
+def _spectrum(
+    kvp: float, angle: float, filtration: Slabs, output: float, bin_kev: float
+) -> Spectrum:
     energies, fluence = _bare_tube(kvp, angle, bin_kev)
     depth = sum(m.attenuation(energies) * t for m, t in filtration)
     fluence = output * fluence * np.exp(-depth)

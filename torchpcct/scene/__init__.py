@@ -1,10 +1,10 @@
 """The scanned object: analytic bodies in mm, their materials and their motion.
 
-Read :mod:`~torchpcct.scene.scene` first (what a scene is, how bodies nest), then :mod:`~.bodies` and :mod:`~.tubes`
-(shapes), :mod:`~.materials`, :mod:`~.motion`. :mod:`~.chords` packs shapes for the
-numba kernels of :mod:`~.chord_kernels`: exact path lengths of rays. :mod:`~.raster` fills voxels, for reference images
-only. :mod:`~.voxels` makes a scene of a CT volume. Ready-made scenes: :mod:`~torchpcct.scene.plaque`,
-:mod:`~torchpcct.scene.phantoms`.
+Read :mod:`~torchpcct.scene.scene` first (what a scene is, how bodies nest), then :mod:`~.bodies`
+and :mod:`~.tubes` (shapes), :mod:`~.materials`, :mod:`~.motion`. :mod:`~.chords` packs shapes for
+the numba kernels of :mod:`~.chord_kernels`: exact path lengths of rays. :mod:`~.raster` fills
+voxels, for reference images only. :mod:`~.voxels` makes a scene of a CT volume. Ready-made scenes:
+:mod:`~torchpcct.scene.plaque`, :mod:`~torchpcct.scene.phantoms`.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -1,8 +1,9 @@
 """Analytic solid shapes: position and rotation in the scanner's frame (mm), never voxelised.
 
-A shape's local frame has its origin at ``position``; the columns of ``rotation`` are the local axes in the scanner's
-frame, so that ``scanner = position + rotation @ local``. Exact chords of rays through these shapes are in
-:mod:`torchpcct.scene.chords`; how shapes nest into an object is in :mod:`torchpcct.scene.scene`.
+A shape's local frame has its origin at ``position``; the columns of ``rotation`` are the local axes
+in the scanner's frame, so that ``scanner = position + rotation @ local``. Exact chords of rays
+through these shapes are in :mod:`torchpcct.scene.chords`; how shapes nest into an object is in
+:mod:`torchpcct.scene.scene`.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ _ORTHOGONAL = 1e-9
 
 @checked
 def rotation_matrix(axis: ArrayLike, angle: float) -> Floats:
-    """Right-handed rotation by ``angle`` rad about ``axis`` (3 numbers, any length > 0), ``(3, 3)`` float64.
+    """Right-handed rotation by ``angle`` rad about ``axis`` (3 numbers, any length > 0), ``(3, 3)``
+    float64.
 
     Raises:
         ValueError: an axis of zero length or of other than 3 components.
@@ -50,11 +52,14 @@ def _rotation(value: Any) -> Matrix:
     else:
         m = reals("rotation", value)
         if m.shape != (3, 3):
-            raise ValueError(f"rotation must be an angle about z in rad or a 3 × 3 matrix, got shape {m.shape}")
+            raise ValueError(
+                f"rotation must be an angle about z in rad or a 3 × 3 matrix, got shape {m.shape}"
+            )
         proper = np.abs(m @ m.T - np.eye(3)).max() < _ORTHOGONAL and np.linalg.det(m) > 0
         if not proper:
             raise ValueError(
-                f"rotation must be a proper rotation matrix (orthonormal, determinant +1), got {m.tolist()}"
+                "rotation must be a proper rotation matrix (orthonormal, determinant +1), got "
+                f"{m.tolist()}"
             )
     return tuple(tuple(float(v) for v in row) for row in m)  # type: ignore[return-value]
 
@@ -74,7 +79,9 @@ def disc_points(count: int) -> Floats:
     rings = max(int(math.sqrt(count / 4.0)), 2)
     phi = np.arange(4 * rings) * (2.0 * math.pi / (4 * rings))
     radius = np.linspace(0.0, 1.0, rings + 1)
-    return np.stack([np.outer(radius, np.cos(phi)).ravel(), np.outer(radius, np.sin(phi)).ravel()], axis=1)
+    return np.stack(
+        [np.outer(radius, np.cos(phi)).ravel(), np.outer(radius, np.sin(phi)).ravel()], axis=1
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +90,8 @@ class Shape:
 
     Args:
         position: ``(x, y, z)`` of the local origin in mm.
-        rotation: a 3 × 3 proper rotation matrix (local to scanner axes), or one number: an angle about +z in rad.
+        rotation: a 3 × 3 proper rotation matrix (local to scanner axes), or one number: an angle
+            about +z in rad.
 
     Raises:
         ValueError, TypeError: a value out of range or of the wrong kind; the message names it.
@@ -124,23 +132,27 @@ class Shape:
         return self._level(self.to_local(p))
 
     def contains(self, points: ArrayLike) -> Bools:
-        """Whether each point ``(..., 3)`` (mm, scanner's frame) lies inside or on the surface, ``(...)`` bool."""
+        """Whether each point ``(..., 3)`` (mm, scanner's frame) lies inside or on the surface,
+        ``(...)`` bool."""
         return self.level(points) <= 1.0
 
     def surface_points(self, count: int = 2000) -> Floats:
-        """About ``count`` points of the surface, ``(N, 3)`` mm; infinite shapes are cut at ± 2000 mm."""
+        """About ``count`` points of the surface, ``(N, 3)`` mm; infinite shapes are cut at ±
+        2000 mm."""
         return self.to_scanner(self._surface(count))
 
     @property
     def bounding_box(self) -> Floats:
-        """Lowest and highest corner of an axis-parallel box that holds the shape, ``(2, 3)`` mm (may be infinite)."""
+        """Lowest and highest corner of an axis-parallel box that holds the shape, ``(2, 3)`` mm
+        (may be infinite)."""
         half = self._half_extent()
         position = np.array(self.position)
         return np.stack([position - half, position + half])
 
     @property
     def rotationally_symmetric(self) -> bool:
-        """Whether turning the shape about the scanner's z axis leaves it as it is (then every view sees the same)."""
+        """Whether turning the shape about the scanner's z axis leaves it as it is (then every
+        view sees the same)."""
         raise NotImplementedError
 
     @property
@@ -198,7 +210,8 @@ class EllipticCylinder(Shape):
     """A solid cylinder of elliptic section along the local z axis.
 
     Args:
-        semi_axes: the two semi-axes of the section along the local x and y in mm, or one number for a circle.
+        semi_axes: the two semi-axes of the section along the local x and y in mm, or one number for
+            a circle.
         half_length: half the height in mm; ``inf`` (the default) for an endless cylinder.
     """
 
@@ -209,7 +222,11 @@ class EllipticCylinder(Shape):
         super().__post_init__()
         axes = (self.semi_axes,) * 2 if np.ndim(self.semi_axes) == 0 else self.semi_axes
         object.__setattr__(self, "semi_axes", numbers("semi_axes", axes, 2, positive=True))
-        object.__setattr__(self, "half_length", number("half_length", self.half_length, positive=True, finite=False))
+        object.__setattr__(
+            self,
+            "half_length",
+            number("half_length", self.half_length, positive=True, finite=False),
+        )
 
     @property
     def rotationally_symmetric(self) -> bool:
@@ -224,9 +241,14 @@ class EllipticCylinder(Shape):
         phi = np.arange(64) * (2.0 * math.pi / 64)
         half = min(self.half_length, FAR)
         z = np.linspace(-half, half, max(count // 64, 2) | 1)
-        side = np.stack([np.tile(a * np.cos(phi), z.size), np.tile(b * np.sin(phi), z.size), np.repeat(z, 64)], axis=1)
+        side = np.stack(
+            [np.tile(a * np.cos(phi), z.size), np.tile(b * np.sin(phi), z.size), np.repeat(z, 64)],
+            axis=1,
+        )
         cap = np.pad(disc_points(count // 4) * (a, b), ((0, 0), (0, 1)))
-        return np.concatenate([side, cap + np.array([0.0, 0.0, half]), cap - np.array([0.0, 0.0, half])])
+        return np.concatenate(
+            [side, cap + np.array([0.0, 0.0, half]), cap - np.array([0.0, 0.0, half])]
+        )
 
     def _half_extent(self) -> Floats:
         section = np.sqrt(((self.matrix[:, :2] * np.array(self.semi_axes)) ** 2).sum(axis=1))

@@ -1,8 +1,9 @@
 """The kernels behind :mod:`torchpcct.scene.chords`: one ray through one packed shape.
 
-In a tube's section coordinates ``u = X s_x - 1``, ``v = y s_y`` with ``X = x + R`` both tubes are the unit circle:
-``s_x = 1 / (R + d), s_y = 1 / R`` for the bulged one, ``s_x = s_y = (R + d) / R²`` for the narrowed one, with the
-profile ``d(z)``. The implicit function along a ray is ``h(t) = u² + v² - 1``.
+In a tube's section coordinates ``u = X s_x - 1``, ``v = y s_y`` with ``X = x + R`` both tubes are
+the unit circle: ``s_x = 1 / (R + d), s_y = 1 / R`` for the bulged one, ``s_x = s_y = (R + d) / R²``
+for the narrowed one, with the profile ``d(z)``. The implicit function along a ray is ``h(t) = u² +
+v² - 1``.
 """
 
 from __future__ import annotations
@@ -18,16 +19,19 @@ __all__ = ["BOX", "BULGED", "CYLINDER", "ELLIPSOID", "NARROWED", "chords", "inte
 
 # Kinds of packed shapes.
 ELLIPSOID, CYLINDER, BOX, BULGED, NARROWED = range(5)
-# Contraction to FMA is safe; reassociation would undo the cancellation-free order of the operations below. Functions
-# that take a row are inlined: else numba counts references to it, and all threads would fight for the counter.
+# Contraction to FMA is safe; reassociation would undo the cancellation-free order of the operations
+# below. Functions that take a row are inlined: else numba counts references to it, and all threads
+# would fight for the counter.
 _FAST = {"contract", "arcp", "nsz"}
-# Pieces a steep ray is cut into over the bulge; each is searched for one extremum and its crossings.
+# Pieces a steep ray is cut into over the bulge; each is searched for one extremum and its
+# crossings.
 _PIECES = 64
 
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def unit_circle(lx: float, ly: float, ux: float, uy: float) -> Any:
-    """Interval of a line inside the unit circle (its height does not matter); ``t1 <= t0`` for a miss."""
+    """Interval of a line inside the unit circle (its height does not matter); ``t1 <= t0`` for a
+    miss."""
     a = ux * ux + uy * uy
     if a == 0.0:
         if lx * lx + ly * ly < 1.0:
@@ -79,26 +83,90 @@ def _cos_sin(phase: float) -> tuple[float, float]:
     """Cosine and sine of a phase within ±4 to 1e-12: a quarter of the time of two library calls."""
     half = 0.5 * phase
     q = half * half
-    c = 1.0 - q * (1 / 2 - q * (1 / 24 - q * (1 / 720 - q * (1 / 40320 - q * (1 / 3628800 - q * (1 / 479001600
-        - q * (1 / 87178291200 - q * (1 / 20922789888000 - q / 6402373705728000))))))))  # fmt: skip
-    s = half * (1.0 - q * (1 / 6 - q * (1 / 120 - q * (1 / 5040 - q * (1 / 362880 - q * (1 / 39916800
-        - q * (1 / 6227020800 - q * (1 / 1307674368000 - q / 355687428096000))))))))  # fmt: skip
+    c = 1.0 - q * (
+        1 / 2
+        - q
+        * (
+            1 / 24
+            - q
+            * (
+                1 / 720
+                - q
+                * (
+                    1 / 40320
+                    - q
+                    * (
+                        1 / 3628800
+                        - q
+                        * (
+                            1 / 479001600
+                            - q
+                            * (1 / 87178291200 - q * (1 / 20922789888000 - q / 6402373705728000))
+                        )
+                    )
+                )
+            )
+        )
+    )
+    s = half * (
+        1.0
+        - q
+        * (
+            1 / 6
+            - q
+            * (
+                1 / 120
+                - q
+                * (
+                    1 / 5040
+                    - q
+                    * (
+                        1 / 362880
+                        - q
+                        * (
+                            1 / 39916800
+                            - q * (1 / 6227020800 - q * (1 / 1307674368000 - q / 355687428096000))
+                        )
+                    )
+                )
+            )
+        )
+    )
     return 2.0 * c * c - 1.0, 2.0 * s * c
 
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _shallow_level(
-    narrowed: bool, t: float, X: float, y: float, z: float, ux: float, uy: float, uz: float,
-    radius: float, half_amplitude: float, omega: float, reach: float, c0: float, s0: float,
-) -> tuple[float, float]:  # fmt: skip
-    """``h`` and ``dh/dt`` at ``t`` from the point (X, y, z) whose phase has the cosine ``c0`` and the sine ``s0``."""
+    narrowed: bool,
+    t: float,
+    X: float,
+    y: float,
+    z: float,
+    ux: float,
+    uy: float,
+    uz: float,
+    radius: float,
+    half_amplitude: float,
+    omega: float,
+    reach: float,
+    c0: float,
+    s0: float,
+) -> tuple[float, float]:
+    """``h`` and ``dh/dt`` at ``t`` from the point (X, y, z) whose phase has the cosine ``c0``
+    and the sine ``s0``."""
     d, slope = 0.0, 0.0
     if abs(z + t * uz) < reach:
         phase = omega * uz * t
         q = phase * phase
-        # Taylor series: the phase is small, and a call of sin and cos would cost more than all the rest.
-        s = phase * (1.0 - q * (1 / 6 - q * (1 / 120 - q * (1 / 5040 - q * (1 / 362880 - q / 39916800)))))
-        c = 1.0 - q * (1 / 2 - q * (1 / 24 - q * (1 / 720 - q * (1 / 40320 - q * (1 / 3628800 - q / 479001600)))))
+        # Taylor series: the phase is small, and a call of sin and cos would cost more than all the
+        # rest.
+        s = phase * (
+            1.0 - q * (1 / 6 - q * (1 / 120 - q * (1 / 5040 - q * (1 / 362880 - q / 39916800))))
+        )
+        c = 1.0 - q * (
+            1 / 2
+            - q * (1 / 24 - q * (1 / 720 - q * (1 / 40320 - q * (1 / 3628800 - q / 479001600))))
+        )
         d = half_amplitude * (1.0 + (c0 * c - s0 * s))
         slope = -half_amplitude * omega * uz * (s0 * c + c0 * s)
     return _level(narrowed, X + t * ux, y + t * uy, ux, uy, radius, d, slope)
@@ -106,9 +174,18 @@ def _shallow_level(
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def shallow(
-    narrowed: bool, lx: float, ly: float, lz: float, ux: float, uy: float, uz: float,
-    radius: float, amplitude: float, omega: float, reach: float,
-) -> Any:  # fmt: skip
+    narrowed: bool,
+    lx: float,
+    ly: float,
+    lz: float,
+    ux: float,
+    uy: float,
+    uz: float,
+    radius: float,
+    amplitude: float,
+    omega: float,
+    reach: float,
+) -> Any:
     """Interval of a ray of small slope inside the endless tube; ``t1 <= t0`` for a miss."""
     flat = ux * ux + uy * uy
     if flat == 0.0:  # only for a tube without a bulge, whose slope is not limited
@@ -144,9 +221,12 @@ def shallow(
         if lowest > 1.0:
             return 0.0, 0.0
         grazing = True
-        # The true minimum of h. The fixed section's curvature is within a few per cent of the true one.
+        # The true minimum of h. The fixed section's curvature is within a few per cent of the true
+        # one.
         for _ in range(12):
-            h, slope = _shallow_level(narrowed, t, X, y, z, ux, uy, uz, radius, half_amplitude, omega, reach, c0, s0)
+            h, slope = _shallow_level(
+                narrowed, t, X, y, z, ux, uy, uz, radius, half_amplitude, omega, reach, c0, s0
+            )
             step = 0.5 * slope / curvature
             lowest = h - 0.5 * slope * step
             t -= step
@@ -157,7 +237,8 @@ def shallow(
     half = math.sqrt(-lowest / curvature)
     t0, t1 = t - half, t + half
     if uz != 0.0:
-        # First the change of the profile on the way to either end, to first order where the fixed section has h = 0.
+        # First the change of the profile on the way to either end, to first order where the fixed
+        # section has h = 0.
         if not grazing and abs(z) < reach:
             phase = omega * uz
             turn, bend = half_amplitude * phase * s0, 0.5 * half_amplitude * phase * phase * c0
@@ -171,15 +252,22 @@ def shallow(
                 scale *= sx
                 t0 += scale * u0 * (1.0 + u0) * (turn + bend * t0) * t0
                 t1 -= scale * u1 * (1.0 + u1) * (turn + bend * t1) * t1
-        # Newton's method at both ends at once, with the fixed section's curvature as second derivative. After a step s
-        # the error is less than s² / (20 half).
+        # Newton's method at both ends at once, with the fixed section's curvature as second
+        # derivative. After a step s the error is less than s² / (20 half).
         enough = 2e-10 * half
         for _ in range(30):
-            h0, g0 = _shallow_level(narrowed, t0, X, y, z, ux, uy, uz, radius, half_amplitude, omega, reach, c0, s0)
-            h1, g1 = _shallow_level(narrowed, t1, X, y, z, ux, uy, uz, radius, half_amplitude, omega, reach, c0, s0)
+            h0, g0 = _shallow_level(
+                narrowed, t0, X, y, z, ux, uy, uz, radius, half_amplitude, omega, reach, c0, s0
+            )
+            h1, g1 = _shallow_level(
+                narrowed, t1, X, y, z, ux, uy, uz, radius, half_amplitude, omega, reach, c0, s0
+            )
             g0, g1 = 1.0 / g0, 1.0 / g1
             step0, step1 = h0 * g0, h1 * g1
-            step0, step1 = step0 * (1.0 + curvature * step0 * g0), step1 * (1.0 + curvature * step1 * g1)
+            step0, step1 = (
+                step0 * (1.0 + curvature * step0 * g0),
+                step1 * (1.0 + curvature * step1 * g1),
+            )
             t0, t1 = t0 - step0, t1 - step1
             if not step0 * step0 + step1 * step1 > enough:
                 break
@@ -188,9 +276,18 @@ def shallow(
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _bulge_level(
-    narrowed: bool, t: float, lx: float, ly: float, lz: float, ux: float, uy: float, uz: float,
-    radius: float, amplitude: float, omega: float,
-) -> tuple[float, float]:  # fmt: skip
+    narrowed: bool,
+    t: float,
+    lx: float,
+    ly: float,
+    lz: float,
+    ux: float,
+    uy: float,
+    uz: float,
+    radius: float,
+    amplitude: float,
+    omega: float,
+) -> tuple[float, float]:
     phase = omega * (lz + t * uz)
     d = 0.5 * amplitude * (1.0 + math.cos(phase))
     slope = -0.5 * amplitude * omega * uz * math.sin(phase)
@@ -199,9 +296,20 @@ def _bulge_level(
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _bisect(
-    want_slope: bool, narrowed: bool, ta: float, tb: float, lx: float, ly: float, lz: float,
-    ux: float, uy: float, uz: float, radius: float, amplitude: float, omega: float,
-) -> float:  # fmt: skip
+    want_slope: bool,
+    narrowed: bool,
+    ta: float,
+    tb: float,
+    lx: float,
+    ly: float,
+    lz: float,
+    ux: float,
+    uy: float,
+    uz: float,
+    radius: float,
+    amplitude: float,
+    omega: float,
+) -> float:
     """Zero of ``h`` (or of ``dh/dt``) between ``ta`` and ``tb``, where it has opposite signs."""
     h, slope = _bulge_level(narrowed, ta, lx, ly, lz, ux, uy, uz, radius, amplitude, omega)
     rising = (slope if want_slope else h) < 0.0
@@ -217,9 +325,19 @@ def _bisect(
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def steep(
-    narrowed: bool, lx: float, ly: float, lz: float, ux: float, uy: float, uz: float,
-    radius: float, amplitude: float, omega: float, reach: float, half_length: float,
-) -> Any:  # fmt: skip
+    narrowed: bool,
+    lx: float,
+    ly: float,
+    lz: float,
+    ux: float,
+    uy: float,
+    uz: float,
+    radius: float,
+    amplitude: float,
+    omega: float,
+    reach: float,
+    half_length: float,
+) -> Any:
     """First entry of any ray into the tube and, added to it, the total length inside."""
     total, first = 0.0, math.inf
     bulge0, bulge1 = (-reach - lz) / uz, (reach - lz) / uz
@@ -244,10 +362,15 @@ def steep(
         for k in range(1, _PIECES + 1):
             tb = near + (far - near) * k / _PIECES
             hb, sb = _bulge_level(narrowed, tb, lx, ly, lz, ux, uy, uz, radius, amplitude, omega)
-            # Where both ends lie on one side of the surface, an extremum between them may lie on the other.
+            # Where both ends lie on one side of the surface, an extremum between them may lie on
+            # the other.
             tm, hm = tb, hb
-            if (ha > 0.0 and hb > 0.0 and sa < 0.0 and sb > 0.0) or (ha < 0.0 and hb < 0.0 and sa > 0.0 and sb < 0.0):
-                tm = _bisect(True, narrowed, ta, tb, lx, ly, lz, ux, uy, uz, radius, amplitude, omega)
+            if (ha > 0.0 and hb > 0.0 and sa < 0.0 and sb > 0.0) or (
+                ha < 0.0 and hb < 0.0 and sa > 0.0 and sb < 0.0
+            ):
+                tm = _bisect(
+                    True, narrowed, ta, tb, lx, ly, lz, ux, uy, uz, radius, amplitude, omega
+                )
                 hm, _ = _bulge_level(narrowed, tm, lx, ly, lz, ux, uy, uz, radius, amplitude, omega)
             for part in range(2):
                 t0, h0 = (ta, ha) if part == 0 else (tm, hm)
@@ -255,7 +378,9 @@ def steep(
                 if t1 <= t0:
                     continue
                 if (h0 < 0.0) != (h1 < 0.0):
-                    root = _bisect(False, narrowed, t0, t1, lx, ly, lz, ux, uy, uz, radius, amplitude, omega)
+                    root = _bisect(
+                        False, narrowed, t0, t1, lx, ly, lz, ux, uy, uz, radius, amplitude, omega
+                    )
                     if h0 < 0.0:
                         t1 = root
                     else:
@@ -306,18 +431,26 @@ def _box(lx: float, ly: float, lz: float, ux: float, uy: float, uz: float) -> An
 
 @numba.njit(inline="always", cache=True, fastmath=_FAST, error_model="numpy")
 def interval(
-    kind: int, row: NDArray[np.float64], ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
+    kind: int,
+    row: NDArray[np.float64],
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
 ) -> Any:
     """Where the straight line ``o + t d`` is inside one packed shape.
 
     Args:
         kind, row: one element of each of the arrays of ``pack`` (``kinds[b]``, ``params[b]``).
-        ox, oy, oz: a point of the line, usually the source, in mm. Subtract a body's displacement from it.
+        ox, oy, oz: a point of the line, usually the source, in mm. Subtract a body's displacement
+            from it.
         dx, dy, dz: unit direction.
 
     Returns:
-        ``(t0, t1)`` in mm along the line, not clipped to ``t > 0``; ``t1 <= t0`` where the line misses the shape.
-        A line inside an endless shape and parallel to it gives ``(-inf, inf)``.
+        ``(t0, t1)`` in mm along the line, not clipped to ``t > 0``; ``t1 <= t0`` where the line
+        misses the shape. A line inside an endless shape and parallel to it gives ``(-inf, inf)``.
     """
     qx, qy = row[0] - ox, row[1] - oy
     cross = qx * dy - qy * dx
@@ -352,7 +485,9 @@ def interval(
 
 
 @numba.njit(nogil=True, cache=True, fastmath=_FAST, error_model="numpy")
-def chords(begin: int, end: int, kinds: Any, params: Any, origins: Any, directions: Any, out: Any) -> None:
+def chords(
+    begin: int, end: int, kinds: Any, params: Any, origins: Any, directions: Any, out: Any
+) -> None:
     """Chord of the lines ``begin … end`` in every shape, ``out (B, N)``."""
     for n in range(begin, end):
         ox, oy, oz = origins[n, 0], origins[n, 1], origins[n, 2]

@@ -1,16 +1,20 @@
-"""Exact intersections of rays with the analytic shapes, as numba kernels that other kernels can call.
+"""Exact intersections of rays with the analytic shapes, as numba kernels that other kernels can
+call.
 
-``pack`` turns shapes into two arrays; :func:`interval` finds where one ray is inside one packed shape. All in float64:
-away from grazing incidence the end points are exact to about 1e-11 mm for sources a metre away.
+``pack`` turns shapes into two arrays; :func:`interval` finds where one ray is inside one packed
+shape. All in float64: away from grazing incidence the end points are exact to about 1e-11 mm for
+sources a metre away.
 
 Quadrics and boxes are met at most once. The tubes of :mod:`torchpcct.scene.tubes` are not convex:
 
-* a ray of small slope (``|dz|`` below the limit that ``pack`` derives from the tube's profile, 0.12 for a plaque: every
-  ray of a circular scan) sees a section that changes so slowly that the curve it draws in the section's own
-  coordinates is flatter than their unit circle. Then the implicit function is convex along the ray, there are at
-  most two crossings, and Newton's iteration from the section at the closest approach finds both;
-* a steeper ray may leave the tube at a flank of the bulge and enter it again. It is searched piece by piece for all
-  crossings; the interval returned starts at the first entry and has the exact TOTAL length inside.
+* a ray of small slope (``|dz|`` below the limit that ``pack`` derives from the tube's profile, 0.12
+  for a plaque: every ray of a circular scan) sees a section that changes so slowly that the curve
+  it draws in the section's own coordinates is flatter than their unit circle. Then the implicit
+  function is convex along the ray, there are at most two crossings, and Newton's iteration from the
+  section at the closest approach finds both;
+* a steeper ray may leave the tube at a flank of the bulge and enter it again. It is searched piece
+  by piece for all crossings; the interval returned starts at the first entry and has the exact
+  TOTAL length inside.
 """
 
 from __future__ import annotations
@@ -23,30 +27,41 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torchpcct.scene.bodies import Box, Ellipsoid, EllipticCylinder, Shape
-from torchpcct.scene.chord_kernels import BOX, BULGED, CYLINDER, ELLIPSOID, NARROWED, chords, interval
+from torchpcct.scene.chord_kernels import (
+    BOX,
+    BULGED,
+    CYLINDER,
+    ELLIPSOID,
+    NARROWED,
+    chords,
+    interval,
+)
 from torchpcct.scene.tubes import BulgedTube, NarrowedTube
 from torchpcct.threads import run
 from torchpcct.validate import checked
 
 __all__ = ["PARAMETERS", "chord_lengths", "interval", "pack"]
 
-# Row of ``params``: 0-2 centre of the bounding z cylinder, 3 its radius squared, 4 radius, 5 half height; 6-8 position;
-# 9-17 matrix from scanner to local axes (scaled to the unit shape for ellipsoid, cylinder section and box);
-# 18 half length; 19-23 tubes: radius, amplitude, 2 π / bulge length, bulge length / 2, largest slope of the fast path.
+# Row of ``params``: 0-2 centre of the bounding z cylinder, 3 its radius squared, 4 radius, 5 half
+# height; 6-8 position; 9-17 matrix from scanner to local axes (scaled to the unit shape for
+# ellipsoid, cylinder section and box); 18 half length; 19-23 tubes: radius, amplitude, 2 π / bulge
+# length, bulge length / 2, largest slope of the fast path.
 PARAMETERS = 24
 
 # Largest phase of the profile (rad) that the series in the kernels carry to 1e-11.
 _SERIES = 0.7
-# The bounding cylinder is a little wider than the shape, so that rounding never rejects a ray that grazes it.
+# The bounding cylinder is a little wider than the shape, so that rounding never rejects a ray that
+# grazes it.
 _SLACK = 1.0 + 1e-9
 
 
 def _slope_limit(shape: Any) -> float:
-    """Largest ``|dz|`` for which ``h`` is convex along the ray and the phase stays in the series' range.
+    """Largest ``|dz|`` for which ``h`` is convex along the ray and the phase stays in the series'
+    range.
 
     In the section's coordinates the ray is a curve of acceleration ``P''`` and speed ``|P'|``.
-    ``h'' = 2 |P'|² + 2 P·P''`` is positive while ``|P| |P''| < |P'|²``; the bounds hold in the whole bounding disc, and
-    a factor 2 is in hand.
+    ``h'' = 2 |P'|² + 2 P·P''`` is positive while ``|P| |P''| < |P'|²``; the bounds hold in the
+    whole bounding disc, and a factor 2 is in hand.
     """
     r, a = shape.radius, shape.amplitude
     if a == 0.0:
@@ -106,7 +121,9 @@ def pack(shapes: Sequence[Shape]) -> tuple[NDArray[np.int64], NDArray[np.float64
     params = np.zeros((len(shapes), PARAMETERS), dtype=np.float64)
     for b, shape in enumerate(shapes):
         if not isinstance(shape, Shape):
-            raise TypeError(f"shapes[{b}] must be a shape of torchpcct.scene, got {type(shape).__name__}")
+            raise TypeError(
+                f"shapes[{b}] must be a shape of torchpcct.scene, got {type(shape).__name__}"
+            )
         row = params[b]
         low, high = shape.bounding_box
         finite = np.isfinite(low) & np.isfinite(high)
@@ -142,7 +159,8 @@ def chord_lengths(scene: Any, origins: ArrayLike, directions: ArrayLike) -> NDAr
     Args:
         scene: a :class:`~torchpcct.scene.Scene` (at rest) or a sequence of ``B`` shapes.
         origins: a point of each line, ``(N, 3)`` or ``(3,)`` for all, x, y, z in mm.
-        directions: ``(N, 3)`` or ``(3,)`` for all; any length greater than 0. The lines are endless both ways.
+        directions: ``(N, 3)`` or ``(3,)`` for all; any length greater than 0. The lines are endless
+            both ways.
 
     Returns:
         ``(B, N)`` float64 in mm. A child's length is part of its parent's.
@@ -153,7 +171,9 @@ def chord_lengths(scene: Any, origins: ArrayLike, directions: ArrayLike) -> NDAr
     """
     shapes = getattr(scene, "shapes", scene)
     if not isinstance(shapes, Sequence):
-        raise TypeError(f"scene must be a Scene or a sequence of shapes, got {type(scene).__name__}")
+        raise TypeError(
+            f"scene must be a Scene or a sequence of shapes, got {type(scene).__name__}"
+        )
     kinds, params = pack(shapes)
     o = np.atleast_2d(np.asarray(origins, dtype=np.float64))
     d = np.atleast_2d(np.asarray(directions, dtype=np.float64))
@@ -161,12 +181,20 @@ def chord_lengths(scene: Any, origins: ArrayLike, directions: ArrayLike) -> NDAr
         if value.ndim != 2 or value.shape[1] != 3:
             raise ValueError(f"{name} must have the shape (N, 3) or (3,), got {value.shape}")
         if not np.isfinite(value).all():
-            raise ValueError(f"{name} must be finite, but row {int(np.argwhere(~np.isfinite(value))[0, 0])} is not")
+            raise ValueError(
+                f"{name} must be finite, but row {int(np.argwhere(~np.isfinite(value))[0, 0])} is "
+                "not"
+            )
     if o.shape[0] != d.shape[0] and 1 not in (o.shape[0], d.shape[0]):
-        raise ValueError(f"origins and directions must be equally many (or one single), got {len(o)} and {len(d)}")
+        raise ValueError(
+            f"origins and directions must be equally many (or one single), got {len(o)} and "
+            f"{len(d)}"
+        )
     length = np.linalg.norm(d, axis=1, keepdims=True)
     if not (length > 0).all():
-        raise ValueError(f"directions must have a length greater than 0, but row {int(np.argmin(length))} is 0")
+        raise ValueError(
+            f"directions must have a length greater than 0, but row {int(np.argmin(length))} is 0"
+        )
     o, d = np.broadcast_arrays(o, d / length)
     out = np.empty((kinds.size, o.shape[0]), dtype=np.float64)
     lines = np.ascontiguousarray(o), np.ascontiguousarray(d)

@@ -1,4 +1,5 @@
-"""Motion of a part of the scene: a body and everything inside it, displaced rigidly in the axial plane."""
+"""Motion of a part of the scene: a body and everything inside it, displaced rigidly in the axial
+plane."""
 
 from __future__ import annotations
 
@@ -16,9 +17,11 @@ __all__ = ["SinusoidalMotion"]
 
 @dataclass(frozen=True)
 class SinusoidalMotion:
-    """A rigid in-plane sinusoid, ``amplitude * sin(2 π f t + phase)``: the simplest model of a beating heart's vessel.
+    """A rigid in-plane sinusoid, ``amplitude * sin(2 π f t + phase)``: the simplest model of a
+    beating heart's vessel.
 
-    With the defaults and a rotation of 0.35 s that starts at t = 0 the displacement covers ``[0, amplitude]``.
+    With the defaults and a rotation of 0.35 s that starts at t = 0 the displacement covers ``[0,
+    amplitude]``.
 
     Args:
         body: name of the body that moves; the bodies inside it move with it.
@@ -39,11 +42,17 @@ class SinusoidalMotion:
 
     def __post_init__(self) -> None:
         if not isinstance(self.body, str):
-            raise TypeError(f"body must be the name of a body, got {self.body!r} ({type(self.body).__name__})")
+            raise TypeError(
+                f"body must be the name of a body, got {self.body!r} ({type(self.body).__name__})"
+            )
         # A negative amplitude is another direction: turn that by π instead.
-        object.__setattr__(self, "amplitude", number("amplitude", self.amplitude, low=0.0, unit="mm"))
+        object.__setattr__(
+            self, "amplitude", number("amplitude", self.amplitude, low=0.0, unit="mm")
+        )
         for name in ("rate_bpm", "phase", "direction"):
-            object.__setattr__(self, name, number(name, getattr(self, name), positive=name == "rate_bpm"))
+            object.__setattr__(
+                self, name, number(name, getattr(self, name), positive=name == "rate_bpm")
+            )
 
     @property
     def _unit(self) -> NDArray[np.float64]:

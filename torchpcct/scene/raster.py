@@ -1,4 +1,5 @@
-"""Volume fractions on a voxel grid: of a scene's bodies, and of regions known only by the label of a point.
+"""Volume fractions on a voxel grid: of a scene's bodies, and of regions known only by the label of
+a point.
 
 Those of bodies serve as reference images and label maps, never to simulate a scan.
 """
@@ -26,19 +27,31 @@ Floats = NDArray[np.float64]
 Labels = Callable[[Floats], NDArray[np.int64]]
 
 _LATTICES = ((13, 8), (21, 13), (55, 34), (233, 144))
-"""Lines across a voxel, coarse to fine, and the generator of their Fibonacci lattice: every projection on an edge is
-even, and faces parallel to an edge are resolved to one line."""
+"""Lines across a voxel, coarse to fine, and the generator of their Fibonacci lattice: every
+projection on an edge is even, and faces parallel to an edge are resolved to one line."""
 _AGREE = 0.001
 """Two lattices whose fractions differ less are taken for converged."""
-_SEGMENTS, _HALVINGS = 4, 8
-"""Of a line through a voxel: pieces whose ends are compared, and halvings of those that a face cuts (1/1024 voxel)."""
-_SLAB, _POINTS = 8, 1 << 19
+_SEGMENTS = 4
+_HALVINGS = 8
+"""Of a line through a voxel: pieces whose ends are compared, and halvings of those that a face
+cuts (1/1024 voxel)."""
+_SLAB = 8
+_POINTS = 1 << 19
 """Slices done together; points asked for at a time."""
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _fill(
-    begin: int, end: int, kinds: Any, params: Any, zs: Any, ys: Any, x_edge: float, dx: float, lines: int, out: Any
+    begin: int,
+    end: int,
+    kinds: Any,
+    params: Any,
+    zs: Any,
+    ys: Any,
+    x_edge: float,
+    dx: float,
+    lines: int,
+    out: Any,
 ) -> None:
     bodies, _, ny, nx = out.shape
     share = 1.0 / lines
@@ -62,19 +75,23 @@ def _fill(
 
 
 @checked
-def volume_fractions(shapes: Sequence[Shape], parents: Sequence[int], grid: VolumeGrid, oversample: int = 16) -> Floats:
-    """Share of each voxel that each of ``B`` nested bodies fills itself, without the bodies inside it.
+def volume_fractions(
+    shapes: Sequence[Shape], parents: Sequence[int], grid: VolumeGrid, oversample: int = 16
+) -> Floats:
+    """Share of each voxel that each of ``B`` nested bodies fills itself, without the bodies inside
+    it.
 
-    Each voxel row is crossed by ``oversample²`` lines along x (a rank-1 lattice over the row's y, z section; 2-D grids:
-    ``oversample`` lines over y in the plane z = 0), each cut exactly: only y and z are sampled. The fractions of all
-    bodies and of the surroundings add up to 1 in every voxel.
+    Each voxel row is crossed by ``oversample²`` lines along x (a rank-1 lattice over the row's y, z
+    section; 2-D grids: ``oversample`` lines over y in the plane z = 0), each cut exactly: only y
+    and z are sampled. The fractions of all bodies and of the surroundings add up to 1 in every
+    voxel.
 
     Args:
         shapes: of the bodies, at rest.
         parents: index of the body around each, −1 for none.
         grid: 2-D or 3-D voxel grid.
-        oversample: lines per voxel edge, at least 1; 16 of voxels of 0.2 mm give a vessel with contrast agent to 0.3 HU
-            rms, 4 only to 2 HU.
+        oversample: lines per voxel edge, at least 1; 16 of voxels of 0.2 mm give a vessel with
+            contrast agent to 0.3 HU rms, 4 only to 2 HU.
 
     Returns:
         ``(B, *grid.shape)`` float64, within 0…1.
@@ -91,7 +108,8 @@ def volume_fractions(shapes: Sequence[Shape], parents: Sequence[int], grid: Volu
     if grid.ndim == 3:
         lines = oversample**2
         step = np.arange(lines) + 0.5
-        # Golden-ratio lattice: no two lines share a y or a z, so edges parallel to an axis are resolved to 1 / lines.
+        # Golden-ratio lattice: no two lines share a y or a z, so edges parallel to an axis are
+        # resolved to 1 / lines.
         across, along = step / lines, np.mod(step * 0.6180339887498949, 1.0)
         zs = grid.axes[0][:, None] + (along - 0.5) * grid.spacing[0]
     else:
@@ -102,9 +120,18 @@ def volume_fractions(shapes: Sequence[Shape], parents: Sequence[int], grid: Volu
     filled = np.zeros((kinds.size, zs.shape[0], y.size, x.size))
     work = 50 * kinds.size * lines
     run(
-        _fill, len(zs) * len(ys), kinds, params, zs, ys, float(x[0] - dx / 2.0), float(dx), lines, filled,
+        _fill,
+        len(zs) * len(ys),
+        kinds,
+        params,
+        zs,
+        ys,
+        float(x[0] - dx / 2.0),
+        float(dx),
+        lines,
+        filled,
         operations=work,
-    )  # fmt: skip
+    )
     own = filled.copy()
     for k, parent in enumerate(parents):
         if parent >= 0:
@@ -114,18 +141,22 @@ def volume_fractions(shapes: Sequence[Shape], parents: Sequence[int], grid: Volu
 
 @checked
 def label_fractions(labels: Labels, count: int, grid: VolumeGrid) -> Floats:
-    """Share of each voxel that each of ``count`` regions fills, where only the label of a point can be asked for.
+    """Share of each voxel that each of ``count`` regions fills, where only the label of a point can
+    be asked for.
 
-    Labels are asked for on a lattice of half the voxel's spacing, corners included. Only where it shows a face, lines
-    are laid through the voxel along the axis that crosses most faces, and cut where the label changes, by halving; more
-    lines (13, 21, 55, 233 on a Fibonacci lattice) as long as the shares still change by more than 0.001. For vessels of
-    voxels of 0.2 mm that is about 50 points a voxel and 0.001 rms against converged shares; ``n³`` points cost as much
-    for ``n`` = 4 and are 50 times as wrong.
+    Labels are asked for on a lattice of half the voxel's spacing, corners included. Only where it
+    shows a face, lines are laid through the voxel along the axis that crosses most faces, and cut
+    where the label changes, by halving; more lines (13, 21, 55, 233 on a Fibonacci lattice) as long
+    as the shares still change by more than 0.001. For vessels of voxels of 0.2 mm that is about 50
+    points a voxel and 0.001 rms against converged shares; ``n³`` points cost as much for ``n`` = 4
+    and are 50 times as wrong.
 
     Args:
-        labels: points ``(..., 3)`` x, y, z in mm → ``(...)`` whole numbers below ``count``; negative: in no region.
+        labels: points ``(..., 3)`` x, y, z in mm → ``(...)`` whole numbers below ``count``;
+            negative: in no region.
         count: of regions.
-        grid: ``(z, y, x)``. A region thinner than half a voxel may be missed where it ends inside of one.
+        grid: ``(z, y, x)``. A region thinner than half a voxel may be missed where it ends inside
+            of one.
 
     Returns:
         ``(count, *grid.shape)`` float64, within 0…1.
@@ -151,7 +182,10 @@ def label_fractions(labels: Labels, count: int, grid: VolumeGrid) -> Floats:
         size = (min(_SLAB, grid.shape[0] - first), *grid.shape[1:])
         starts = (grid.axes[0][first], grid.axes[1][0], grid.axes[2][0])
         steps = grid.spacing
-        lattice = [a + d * (np.arange(2 * n + 3) / 2.0 - 1.0) for a, d, n in zip(starts, steps, size, strict=True)]
+        lattice = [
+            a + d * (np.arange(2 * n + 3) / 2.0 - 1.0)
+            for a, d, n in zip(starts, steps, size, strict=True)
+        ]
         z, y, x = np.meshgrid(*lattice, indexing="ij")
         coarse = ask(np.stack([x, y, z], axis=-1))
         middles = (slice(2, -1, 2),) * 3
@@ -180,12 +214,15 @@ def label_fractions(labels: Labels, count: int, grid: VolumeGrid) -> Floats:
 
 
 def _most_cut(coarse: NDArray[np.int64], faces: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """For each voxel with a face the axis (of z, y, x) along which the label changes most often in and about it."""
+    """For each voxel with a face the axis (of z, y, x) along which the label changes most often
+    in and about it."""
     changes = []
     for axis in range(3):
         window = [5, 5, 5]
         window[axis] = 4
-        change = ndimage.uniform_filter((np.diff(coarse, axis=axis) != 0).astype(np.float64), window)
+        change = ndimage.uniform_filter(
+            (np.diff(coarse, axis=axis) != 0).astype(np.float64), window
+        )
         changes.append(change[tuple(slice(2, 2 * n + 2, 2) for n in faces.shape)][faces])
     return np.argmax(np.stack(changes), axis=0)
 
@@ -199,13 +236,16 @@ def _cut(
     lines: int,
     generator: int,
 ) -> Floats:
-    """Shares ``(N, count)`` of voxels about ``centres`` ``(N, 3)`` (z, y, x) from lines along an axis of each."""
+    """Shares ``(N, count)`` of voxels about ``centres`` ``(N, 3)`` (z, y, x) from lines along an
+    axis of each."""
     k, n = np.arange(lines), len(centres)
     across = np.stack([k + 0.5, np.mod(k * generator, lines) + 0.5], axis=1) / lines - 0.5
     edges = np.diag(steps)
     along, first, second = (edges[(axis + a) % 3] for a in range(3))
     lines_at = (
-        centres[:, None] + across[None, :, :1] * first[:, None] + across[None, :, 1:] * second[:, None]
+        centres[:, None]
+        + across[None, :, :1] * first[:, None]
+        + across[None, :, 1:] * second[:, None]
     )  # (N, lines, 3): the middle of each line
 
     def total(voxel: Any, label: Any) -> NDArray[np.int64]:

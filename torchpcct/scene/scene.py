@@ -1,7 +1,7 @@
 """The scene: a tree of nested analytic bodies, each filled with one material.
 
-Bodies NEST and siblings do not overlap, so a line integral is a plain sum: every body adds its whole chord, children
-included, times the difference between its own attenuation and its parent's,
+Bodies NEST and siblings do not overlap, so a line integral is a plain sum: every body adds its
+whole chord, children included, times the difference between its own attenuation and its parent's,
 
     ∫ μ dl = Σ_b chord_b · (μ(material_b) − μ(material_parent(b))),
 
@@ -53,8 +53,11 @@ class Body:
         if not isinstance(self.name, str) or not self.name:
             raise TypeError(f"name must be a non-empty text, got {self.name!r}")
         if not isinstance(self.shape, Shape):
-            raise TypeError(f"body {self.name!r}: shape must be a Shape, got {type(self.shape).__name__}")
-        material_of(self.material)  # an unknown one is refused here, not in the middle of a simulation
+            raise TypeError(
+                f"body {self.name!r}: shape must be a Shape, got {type(self.shape).__name__}"
+            )
+        # an unknown one is refused here, not in the middle of a simulation
+        material_of(self.material)
 
 
 class Scene:
@@ -62,13 +65,14 @@ class Scene:
 
     Args:
         bodies: ``B`` bodies, parents before their children, names unique.
-        motion: one :class:`SinusoidalMotion` or several; each moves a body with everything inside it, and a body inside
-            two moving ones is displaced by the sum.
-        validate: check on construction that children lie inside their parents and siblings apart (:meth:`validate`).
+        motion: one :class:`SinusoidalMotion` or several; each moves a body with everything inside
+            it, and a body inside two moving ones is displaced by the sum.
+        validate: check on construction that children lie inside their parents and siblings apart
+            (:meth:`validate`).
 
     Raises:
-        ValueError: an empty scene, a name twice, a parent that is unknown or listed later, a moving body that does not
-            exist, bodies that overlap.
+        ValueError: an empty scene, a name twice, a parent that is unknown or listed later, a moving
+            body that does not exist, bodies that overlap.
         TypeError: an element that is not a :class:`Body` or a motion.
     """
 
@@ -88,10 +92,13 @@ class Scene:
             if not isinstance(body, Body):
                 raise TypeError(f"bodies[{k}] must be a Body, got {type(body).__name__}")
             if body.name in index:
-                raise ValueError(f"the name {body.name!r} is used twice: names of bodies must be unique")
+                raise ValueError(
+                    f"the name {body.name!r} is used twice: names of bodies must be unique"
+                )
             if body.parent is not None and body.parent not in index:
                 raise ValueError(
-                    f"body {body.name!r}: its parent {body.parent!r} is not among the bodies before it "
+                    f"body {body.name!r}: its parent {body.parent!r} is not among the bodies "
+                    "before it "
                     f"({', '.join(index) or 'none'}): list parents before their children"
                 )
             index[body.name] = k
@@ -102,14 +109,19 @@ class Scene:
             motions = (motion,) if isinstance(motion, SinusoidalMotion) else tuple(motion)
         for move in motions:
             if not isinstance(move, SinusoidalMotion):
-                raise TypeError(f"motion must be a SinusoidalMotion or several, got {type(move).__name__}")
+                raise TypeError(
+                    f"motion must be a SinusoidalMotion or several, got {type(move).__name__}"
+                )
             self.index(move.body)
         self.motion = motions
         if validate:
             self.validate()
 
     def __repr__(self) -> str:
-        return f"Scene({len(self.bodies)} bodies: {', '.join(self.names)}{'' if self.is_static else '; moving'})"
+        return (
+            f"Scene({len(self.bodies)} bodies: "
+            f"{', '.join(self.names)}{'' if self.is_static else '; moving'})"
+        )
 
     def __len__(self) -> int:
         return len(self.bodies)
@@ -136,7 +148,9 @@ class Scene:
     @property
     def parents(self) -> NDArray[np.int64]:
         """Index of each body's parent, −1 for none, ``(B,)``."""
-        return np.array([-1 if b.parent is None else self._index[b.parent] for b in self.bodies], dtype=np.int64)
+        return np.array(
+            [-1 if b.parent is None else self._index[b.parent] for b in self.bodies], dtype=np.int64
+        )
 
     @property
     def materials(self) -> tuple[Material, ...]:
@@ -153,7 +167,8 @@ class Scene:
         return tuple(members)
 
     def contrast(self, energies: ArrayLike) -> Floats:
-        """What a chord of each body adds to a line integral: ``μ(material) − μ(parent's material)``.
+        """What a chord of each body adds to a line integral: ``μ(material) − μ(parent's
+        material)``.
 
         Args:
             energies: photon energies ``(E,)`` in keV.
@@ -161,7 +176,9 @@ class Scene:
         Returns:
             ``(B, E)`` float64 in mm⁻¹.
         """
-        mu = np.stack([np.asarray(m.attenuation(energies), dtype=np.float64) for m in self.materials])
+        mu = np.stack(
+            [np.asarray(m.attenuation(energies), dtype=np.float64) for m in self.materials]
+        )
         return mu - np.stack([mu[p] if p >= 0 else np.zeros_like(mu[0]) for p in self.parents])
 
     @property
@@ -194,8 +211,11 @@ class Scene:
         return offsets
 
     def bounding_box(self, names: str | Sequence[str] | None = None) -> Floats:
-        """A box that holds the named bodies (all, by default) at all times of their motion, ``(2, 3)`` mm."""
-        wanted = self.names if names is None else ((names,) if isinstance(names, str) else tuple(names))
+        """A box that holds the named bodies (all, by default) at all times of their motion,
+        ``(2, 3)`` mm."""
+        wanted = (
+            self.names if names is None else ((names,) if isinstance(names, str) else tuple(names))
+        )
         low, high = np.full(3, math.inf), np.full(3, -math.inf)
         for name in wanted:
             box = self[name].shape.bounding_box
@@ -204,7 +224,8 @@ class Scene:
         return np.stack([low, high])
 
     def _extremes(self, name: str, seen_from: str | None = None) -> Floats:
-        """All combinations of the extreme displacements of a body, ``(N, 3)``, one row of zeros if it stands still.
+        """All combinations of the extreme displacements of a body, ``(N, 3)``, one row of zeros if
+        it stands still.
 
         ``seen_from``: another body, which may move with it; None: the scanner.
         """
@@ -212,14 +233,17 @@ class Scene:
         for move in self.motion:
             members = self.inside(move.body)
             if move.amplitude > 0 and (name in members) != (seen_from in members):
-                shifts = (shifts[:, None] + np.concatenate([move.extremes(), np.zeros((1, 3))])).reshape(-1, 3)
+                shifts = (
+                    shifts[:, None] + np.concatenate([move.extremes(), np.zeros((1, 3))])
+                ).reshape(-1, 3)
         return shifts
 
     def validate(self, samples: int = 2000) -> None:
-        """Check by about ``samples`` surface points a body that bodies nest: children inside parents, siblings apart.
+        """Check by about ``samples`` surface points a body that bodies nest: children inside
+        parents, siblings apart.
 
-        Touching is allowed (to 1e-7 of a body's size); a moving body is checked at rest and at both ends of its way.
-        A body too small to be hit by its sibling's samples is found by its own.
+        Touching is allowed (to 1e-7 of a body's size); a moving body is checked at rest and at both
+        ends of its way. A body too small to be hit by its sibling's samples is found by its own.
 
         Raises:
             ValueError: names the two bodies and a point of the overlap.
@@ -240,8 +264,10 @@ class Scene:
             worst = int(level.argmax())
             if level[worst] > 1.0 + _TOUCH:
                 raise ValueError(
-                    f"body {self.bodies[k].name!r} leaves its parent {parent.name!r}, for instance at "
-                    f"(x, y, z) = {_format(surface[worst] + shift)} mm: move it, shrink it or name another parent"
+                    f"body {self.bodies[k].name!r} leaves its parent {parent.name!r}, for "
+                    "instance at "
+                    f"(x, y, z) = {_format(surface[worst] + shift)} mm: move it, shrink it or "
+                    "name another parent"
                 )
 
     def _require_apart(self, k: int, j: int, surfaces: Sequence[Floats]) -> None:
@@ -253,7 +279,8 @@ class Scene:
             for points, shape in ((surfaces[k] + shift, b.shape), (surfaces[j] - shift, a.shape)):
                 level = shape.level(points)
                 deepest = int(level.argmin())
-                # Equal bodies have all samples exactly on each other's surface: a point inside tells them apart.
+                # Equal bodies have all samples exactly on each other's surface: a point inside
+                # tells them apart.
                 if level[deepest] < 1.0 - _TOUCH or bool((level <= 1.0 + _TOUCH).all()):
                     raise ValueError(
                         f"bodies {a.name!r} and {b.name!r} overlap, for instance at (x, y, z) = "
@@ -263,27 +290,38 @@ class Scene:
     def replace_material(self, name: str, material: Any) -> Scene:
         """The same scene with another material in the body ``name``."""
         k = self.index(name)
-        bodies = (*self.bodies[:k], replace(self.bodies[k], material=material), *self.bodies[k + 1 :])
+        bodies = (
+            *self.bodies[:k],
+            replace(self.bodies[k], material=material),
+            *self.bodies[k + 1 :],
+        )
         return Scene(bodies, self.motion, validate=False)
 
     def with_motion(self, motion: SinusoidalMotion | Sequence[SinusoidalMotion] | None) -> Scene:
-        """The same bodies with another motion (``None``: at rest); checked for overlap like a new scene."""
+        """The same bodies with another motion (``None``: at rest); checked for overlap like a
+        new scene."""
         return Scene(self.bodies, motion)
 
     def add(self, *bodies: Body) -> Scene:
-        """The scene with further bodies behind the present ones; checked for overlap like a new scene."""
+        """The scene with further bodies behind the present ones; checked for overlap like a new
+        scene."""
         return Scene((*self.bodies, *bodies), self.motion)
 
     def labels(self, where: Any) -> NDArray[np.int64]:
         """Index of the innermost body at points or voxel centres, −1 in the surroundings; at rest.
 
         Args:
-            where: points ``(..., 3)`` of x, y, z in mm, or a :class:`~torchpcct.geometry.VolumeGrid`.
+            where: points ``(..., 3)`` of x, y, z in mm, or a
+                :class:`~torchpcct.geometry.VolumeGrid`.
 
         Returns:
             ``(...)`` or ``grid.shape``, int64.
         """
-        points = voxel_centres(where) if isinstance(where, VolumeGrid) else np.asarray(where, dtype=np.float64)
+        points = (
+            voxel_centres(where)
+            if isinstance(where, VolumeGrid)
+            else np.asarray(where, dtype=np.float64)
+        )
         labels = np.full(points.shape[:-1], -1, dtype=np.int64)
         for k, (body, parent) in enumerate(zip(self.bodies, self.parents, strict=True)):
             labels[(labels == parent) & body.shape.contains(points)] = k
@@ -299,9 +337,14 @@ class Scene:
         return volume_fractions(self.shapes, self.parents.tolist(), grid, oversample)
 
     def render(
-        self, grid: VolumeGrid, values: Mapping[str, float], outside: float = 0.0, oversample: int = 16
+        self,
+        grid: VolumeGrid,
+        values: Mapping[str, float],
+        outside: float = 0.0,
+        oversample: int = 16,
     ) -> Floats:
-        """Reference image: volume-weighted mean of one value per body (HU, mm⁻¹, …) in each voxel, at rest.
+        """Reference image: volume-weighted mean of one value per body (HU, mm⁻¹, …) in each voxel,
+        at rest.
 
         Args:
             grid: 2-D (the plane z = 0) or 3-D.
@@ -314,16 +357,22 @@ class Scene:
         """
         missing = [name for name in self.names if name not in values]
         if missing or len(values) != len(self.bodies):
-            raise ValueError(f"values must name every body once ({', '.join(self.names)}), got {', '.join(values)}")
+            raise ValueError(
+                f"values must name every body once ({', '.join(self.names)}), got "
+                f"{', '.join(values)}"
+            )
         fractions = self.volume_fractions(grid, oversample)
         levels = np.array([values[name] - outside for name in self.names], dtype=np.float64)
         return np.tensordot(levels, fractions, axes=1) + outside
 
     def material_map(self, grid: VolumeGrid, energy_kev: float, oversample: int = 16) -> Floats:
-        """Linear attenuation coefficient of each voxel at one photon energy, mm⁻¹, ``grid.shape`` float64; at rest."""
+        """Linear attenuation coefficient of each voxel at one photon energy, mm⁻¹,
+        ``grid.shape`` float64; at rest."""
         energy = np.atleast_1d(np.asarray(energy_kev, dtype=np.float64))
         if energy.size != 1 or not energy[0] > 0:
-            raise ValueError(f"energy_kev must be one energy greater than 0 keV, got {energy_kev!r}")
+            raise ValueError(
+                f"energy_kev must be one energy greater than 0 keV, got {energy_kev!r}"
+            )
         mu = [float(np.ravel(m.attenuation(energy))[0]) for m in self.materials]
         return self.render(grid, dict(zip(self.names, mu, strict=True)), oversample=oversample)
 

@@ -1,13 +1,14 @@
 """Scenes of voxels: a CT volume in HU as tissues, so that real patients can be scanned.
 
-A CT number alone does not tell a tissue, but tissues of the body lie close to one line. As in the stoichiometric
-calibration of Schneider, Pedroni and Lomax (Phys. Med. Biol. 41, 111, 1996), the CT numbers of reference tissues are
-computed for the spectrum of the given volume. A voxel between two of them is their mixture by volume, as in Schneider,
-Bortfeld and Schlegel (Phys. Med. Biol. 45, 459, 2000). Attenuation is linear in the shares: the mixture reads exactly
-the given number in that spectrum, and in any other what the tissues read.
+A CT number alone does not tell a tissue, but tissues of the body lie close to one line. As in the
+stoichiometric calibration of Schneider, Pedroni and Lomax (Phys. Med. Biol. 41, 111, 1996), the CT
+numbers of reference tissues are computed for the spectrum of the given volume. A voxel between two
+of them is their mixture by volume, as in Schneider, Bortfeld and Schlegel (Phys. Med. Biol. 45,
+459, 2000). Attenuation is linear in the shares: the mixture reads exactly the given number in that
+spectrum, and in any other what the tissues read.
 
-Above muscle the line forks: 300 HU are bone or blood with contrast agent, and no CT number tells which. ``dense`` says
-it, for all voxels or voxel by voxel.
+Above muscle the line forks: 300 HU are bone or blood with contrast agent, and no CT number tells
+which. ``dense`` says it, for all voxels or voxel by voxel.
 """
 
 from __future__ import annotations
@@ -28,7 +29,15 @@ __all__ = ["BODY_TISSUES", "DENSE", "VoxelScene"]
 
 Floats = NDArray[np.float64]
 
-BODY_TISSUES = ("air", "lung", "adipose", "skeletal_muscle", "spongiosa", "cortical_bone", "hydroxyapatite")
+BODY_TISSUES = (
+    "air",
+    "lung",
+    "adipose",
+    "skeletal_muscle",
+    "spongiosa",
+    "cortical_bone",
+    "hydroxyapatite",
+)
 """The line of the body's tissues by CT number (ICRU Report 44; Woodard and White 1986)."""
 _SOFT = BODY_TISSUES[:4]
 
@@ -49,19 +58,21 @@ class VoxelScene:
     """A volume of CT numbers, seen as a mixture of tissues.
 
     Args:
-        hu: ``grid.shape`` CT numbers; what lies outside the grid is air. Below the first tissue's number a voxel is the
-            first tissue, above the last one's the last.
+        hu: ``grid.shape`` CT numbers; what lies outside the grid is air. Below the first tissue's
+            number a voxel is the first tissue, above the last one's the last.
         grid: 3-D voxel grid in the scanner's frame (mm).
         energies_kev, weights: spectrum that the volume was scanned with, as for
-            :meth:`torchpcct.scene.materials.Material.hu`; one number is a mean energy (70 keV: 120 kVp behind a body).
-            Iodine of 300 HU at 70 keV then reads about 400 HU at 100 kVp, as it does in a patient. None: that of the
-            scanner which scans it, behind water as thick as the body; the given numbers come back (see Notes).
-        dense: what stands above muscle: ``"bone"`` (spongiosa, cortical bone, hydroxyapatite), ``"iodine"`` (contrast
-            agent in blood, more of it the brighter), ``"water"`` (no tissue: water of the density that reads the
-            number, the same in every spectrum), or for each voxel a whole number of ``grid.shape``: 0 bone, 1 iodine,
-            2 water, the order of :data:`DENSE`.
-        tissues: instead of ``dense`` and the body's tissues: materials or their names, of increasing CT number in that
-            spectrum.
+            :meth:`torchpcct.scene.materials.Material.hu`; one number is a mean energy (70 keV: 120
+            kVp behind a body). Iodine of 300 HU at 70 keV then reads about 400 HU at 100 kVp, as it
+            does in a patient. None: that of the scanner which scans it, behind water as thick as
+            the body; the given numbers come back (see Notes).
+        dense: what stands above muscle: ``"bone"`` (spongiosa, cortical bone, hydroxyapatite),
+            ``"iodine"`` (contrast agent in blood, more of it the brighter), ``"water"`` (no tissue:
+            water of the density that reads the number, the same in every spectrum), or for each
+            voxel a whole number of ``grid.shape``: 0 bone, 1 iodine, 2 water, the order of
+            :data:`DENSE`.
+        tissues: instead of ``dense`` and the body's tissues: materials or their names, of
+            increasing CT number in that spectrum.
 
     Attributes:
         tissues: all materials.
@@ -69,14 +80,15 @@ class VoxelScene:
         scanners_own: whether it is the scanner's.
 
     Raises:
-        ValueError: a shape that is not the grid's, CT numbers that are not finite, fewer than two tissues, tissues that
-            are not in order, labels that are none of 0, 1, 2.
+        ValueError: a shape that is not the grid's, CT numbers that are not finite, fewer than two
+            tissues, tissues that are not in order, labels that are none of 0, 1, 2.
         TypeError: a grid, a tissue or labels of the wrong kind.
 
     Notes:
-        With the scanner's own spectrum FBP of a polychromatic scan gives the numbers back: -1000 to 300 HU within 5 HU
-        (100 kVp silicon; rods of 20 mm in 200 mm of 0 HU; iodine 5.3). Denser matter hardens the beam for itself
-        and reads less, as in a patient. Read minus given, rod of 20 mm (10 mm):
+        With the scanner's own spectrum FBP of a polychromatic scan gives the numbers back: -1000 to
+            300 HU within 5 HU
+        (100 kVp silicon; rods of 20 mm in 200 mm of 0 HU; iodine 5.3). Denser matter hardens the
+        beam for itself and reads less, as in a patient. Read minus given, rod of 20 mm (10 mm):
 
         ======  =============  =============  ===========
         HU      bone           iodine         water
@@ -103,16 +115,23 @@ class VoxelScene:
     ) -> None:
         values = np.asarray(hu, dtype=np.float32)
         if grid.ndim != 3 or values.shape != grid.shape:
-            raise ValueError(f"hu needs the shape (z, y, x) of its grid, {grid.shape}, got {values.shape}")
+            raise ValueError(
+                f"hu needs the shape (z, y, x) of its grid, {grid.shape}, got {values.shape}"
+            )
         if not np.isfinite(values).all():
-            raise ValueError(f"{int((~np.isfinite(values)).sum())} voxels are NaN or Inf: give them a CT number")
+            raise ValueError(
+                f"{int((~np.isfinite(values)).sum())} voxels are NaN or Inf: give them a CT number"
+            )
         self.hu, self.grid = values, grid
         self.scanners_own = energies_kev is None
         self.labels: NDArray[np.int64] | None = None
         self._dense: tuple[str, ...] = ()
         if tissues is not None:
             if not (isinstance(dense, str) and dense == "bone"):
-                raise ValueError("give dense or tissues, not both: tissues are the whole line, dense its upper end")
+                raise ValueError(
+                    "give dense or tissues, not both: tissues are the whole line, dense its upper "
+                    "end"
+                )
             lines = [tuple(material(t) for t in tissues)]
             if len(lines[0]) < 2:
                 raise ValueError(f"tissues must be two or more, got {len(lines[0])}")
@@ -131,10 +150,13 @@ class VoxelScene:
         for line in self._lines:
             if (np.diff(self.numbers[line]) <= 0).any():
                 listed = ", ".join(f"{self.tissues[k].name} {self.numbers[k]:.0f}" for k in line)
-                raise ValueError(f"tissues must be in the order of their CT numbers, got {listed} HU")
+                raise ValueError(
+                    f"tissues must be in the order of their CT numbers, got {listed} HU"
+                )
 
     def read_by(self, energies_kev: Any, weights: Any) -> VoxelScene:
-        """The same volume, its numbers read in a scanner's spectrum behind water as thick as the body.
+        """The same volume, its numbers read in a scanner's spectrum behind water as thick as the
+        body.
 
         Args:
             energies_kev, weights: ``(E,)`` the scanner's signal in air.
@@ -159,7 +181,8 @@ class VoxelScene:
 
     @property
     def water_diameter(self) -> float:
-        """Water-equivalent diameter in mm (AAPM Report 220): the mean over the slices that hold a body; 0: none."""
+        """Water-equivalent diameter in mm (AAPM Report 220): the mean over the slices that hold
+        a body; 0: none."""
         body = (self.hu > _BODY_HU).any((1, 2))
         area = (1.0 + self.hu[body].astype(np.float64) / 1000.0).clip(0.0).sum((1, 2))
         sizes = 2.0 * np.sqrt(area * self.grid.spacing[1] * self.grid.spacing[2] / math.pi)
@@ -167,31 +190,42 @@ class VoxelScene:
 
     @property
     def clipped(self) -> float:
-        """Share of the voxels that no mixture reaches: below the first tissue's number or above the last one's."""
+        """Share of the voxels that no mixture reaches: below the first tissue's number or above
+        the last one's."""
         ends = self._of_voxels([self.numbers[line[-1]] for line in self._lines])
         return float(((self.hu < self.numbers[0] - 1.0) | (self.hu > ends)).mean())
 
     @property
     def above_muscle(self) -> dict[str, float]:
-        """Share of the voxels that read more than muscle, by what they are scanned as (not for own ``tissues``)."""
+        """Share of the voxels that read more than muscle, by what they are scanned as (not for
+        own ``tissues``)."""
         dense = self.hu > self.numbers[min(3, len(self.numbers) - 1)]
         which = np.zeros(1, np.int64) if self.labels is None else self.labels
         return {name: float((dense & (which == k)).mean()) for k, name in enumerate(self._dense)}
 
     def contrast(self, energies: Any) -> Floats:
-        """Attenuation of the tissues minus that of air, which fills the rest: ``(tissues, E)`` mm⁻¹."""
+        """Attenuation of the tissues minus that of air, which fills the rest: ``(tissues, E)``
+        mm⁻¹."""
         mu = np.stack([np.asarray(t.attenuation(energies), dtype=np.float64) for t in self.tissues])
         return mu - np.asarray(MATERIALS["air"].attenuation(energies), dtype=np.float64)
 
     def mixed(self, values: Any) -> NDArray[np.float32]:
-        """One number per tissue as a map: ``(tissues, components)`` to ``(components, z, y, x)`` float32."""
+        """One number per tissue as a map: ``(tissues, components)`` to ``(components, z, y, x)``
+        float32."""
         of_tissues = np.asarray(values, dtype=np.float64)
-        # Interpolation between neighbours in CT number is mixing by volume; beyond both ends the end's value stays.
+        # Interpolation between neighbours in CT number is mixing by volume; beyond both ends the
+        # end's value stays.
         maps = [
-            self._of_voxels([np.interp(self.hu, self.numbers[line], column[line]) for line in self._lines])
+            self._of_voxels(
+                [np.interp(self.hu, self.numbers[line], column[line]) for line in self._lines]
+            )
             for column in of_tissues.T
         ]
-        return np.stack(maps).astype(np.float32) if maps else np.zeros((0, *self.grid.shape), np.float32)
+        return (
+            np.stack(maps).astype(np.float32)
+            if maps
+            else np.zeros((0, *self.grid.shape), np.float32)
+        )
 
     def _of_voxels(self, per_line: list[Any]) -> Any:
         """For every voxel the value of its own line of tissues."""
@@ -201,9 +235,14 @@ class VoxelScene:
 def _labels(value: Any, grid: VolumeGrid) -> NDArray[np.int64]:
     labels = np.asarray(value)
     if labels.dtype.kind not in "biuf":
-        raise TypeError(f"dense must be one of {', '.join(DENSE)}, or a whole number for each voxel, got {value!r}")
+        raise TypeError(
+            f"dense must be one of {', '.join(DENSE)}, or a whole number for each voxel, got "
+            f"{value!r}"
+        )
     if labels.shape != grid.shape:
-        raise ValueError(f"dense needs the shape (z, y, x) of the grid, {grid.shape}, got {labels.shape}")
+        raise ValueError(
+            f"dense needs the shape (z, y, x) of the grid, {grid.shape}, got {labels.shape}"
+        )
     if not np.isin(labels, range(len(DENSE))).all():
         meaning = ", ".join(f"{k} {name}" for k, name in enumerate(DENSE))
         raise ValueError(f"dense must hold {meaning}, got {np.unique(labels)[:5].tolist()}")

@@ -1,8 +1,10 @@
-"""Spectral imaging: basis materials, decomposition of energy bins, virtual monochromatic images, tissue maps.
+"""Spectral imaging: basis materials, decomposition of energy bins, virtual monochromatic images,
+tissue maps.
 
-Reading order: ``basis`` (two materials instead of an attenuation at every energy) → ``model`` (expected counts of a
-scanner behind them) → ``decompose`` with ``decompose_kernels`` (counts → line integrals of the two). What is made of
-the two reconstructed images: ``vmi`` (one energy) and ``mmd`` (tissues).
+Reading order: ``basis`` (two materials instead of an attenuation at every energy) → ``model``
+(expected counts of a scanner behind them) → ``decompose`` with ``decompose_kernels`` (counts → line
+integrals of the two). What is made of the two reconstructed images: ``vmi`` (one energy) and
+``mmd`` (tissues).
 """
 
 from torchpcct.spectral.basis import Basis, pe_pvc

@@ -1,11 +1,12 @@
 """Numba kernels of the projection-domain decomposition. All arithmetic is float64.
 
-Notation of one ray, bin i: expected counts λ_i(a) = s Σ_E S_i(E) exp(−a₁ μ₁(E) − a₂ μ₂(E)); subscripts of λ are
-derivatives by a. ``m[i]`` holds λ, λ₁, λ₂, λ₁₁, λ₁₂, λ₂₂.
+Notation of one ray, bin i: expected counts λ_i(a) = s Σ_E S_i(E) exp(−a₁ μ₁(E) − a₂ μ₂(E));
+subscripts of λ are derivatives by a. ``m[i]`` holds λ, λ₁, λ₂, λ₁₁, λ₁₂, λ₂₂.
 
-Newton's method on the score U = Σ (n*_i − λ_i) ∂λ_i / λ_i, where n* = n, or n plus the pseudo-counts
-c_i = ½ tr(F⁻¹ ∂²λ_i) that remove the bias of order 1 / counts (Firth 1993; this form follows from Cox and Snell's bias
-of a curved Poisson model). F = Σ ∂λ_i ∂λ_iᵀ / λ_i is the Fisher information.
+Newton's method on the score U = Σ (n*_i − λ_i) ∂λ_i / λ_i, where n* = n, or n plus the
+pseudo-counts c_i = ½ tr(F⁻¹ ∂²λ_i) that remove the bias of order 1 / counts (Firth 1993; this form
+follows from Cox and Snell's bias of a curved Poisson model). F = Σ ∂λ_i ∂λ_iᵀ / λ_i is the Fisher
+information.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ from numba import njit
 
 __all__ = ["expected", "solve"]
 
-# exp(x) = 2^k exp(r): one loop without branches or calls, which LLVM turns into vector instructions (numba calls the
-# scalar libm otherwise: 4 times slower). Adding MAGIC leaves round(x / ln 2) in the low bits of the sum.
+# exp(x) = 2^k exp(r): one loop without branches or calls, which LLVM turns into vector instructions
+# (numba calls the scalar libm otherwise: 4 times slower). Adding MAGIC leaves round(x / ln 2) in
+# the low bits of the sum.
 _LOG2E = 1.0 / math.log(2.0)
 _MAGIC = 1.5 * 2.0**52
 _LN2_HIGH = 6.93147180369123816490e-01
@@ -27,7 +29,8 @@ _LN2_LOW = 1.90821492927058770002e-10
 _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9, _C10, _C11 = (1.0 / math.factorial(k) for k in range(2, 12))
 
 # Exponents stay where neither counts nor their products overflow; only passing iterates get there.
-_LOWEST, _HIGHEST = -300.0, 200.0
+_LOWEST = -300.0
+_HIGHEST = 200.0
 
 # After so many steps they are halved, after twice as many quartered, …
 _PATIENCE = 40
@@ -44,8 +47,12 @@ def _transmissions(a1: float, a2: float, mu: Any, v: Any) -> None:
         k = t - _MAGIC
         r = (x - k * _LN2_HIGH) - k * _LN2_LOW
         p = _C8 + r * (_C9 + r * (_C10 + r * _C11))
-        p = 1.0 + r * (1.0 + r * (_C2 + r * (_C3 + r * (_C4 + r * (_C5 + r * (_C6 + r * (_C7 + r * p)))))))
-        w = np.int64(np.float64(p).view(np.int64) + (np.float64(t).view(np.int64) << np.int64(52))).view(np.float64)
+        p = 1.0 + r * (
+            1.0 + r * (_C2 + r * (_C3 + r * (_C4 + r * (_C5 + r * (_C6 + r * (_C7 + r * p))))))
+        )
+        w = np.int64(
+            np.float64(p).view(np.int64) + (np.float64(t).view(np.int64) << np.int64(52))
+        ).view(np.float64)
         w1, w2 = -w * mu1, -w * mu2
         v[0, e] = w
         v[1, e] = w1
@@ -88,7 +95,8 @@ def _information(m: Any) -> Any:
 
 @njit(cache=True, error_model="numpy")
 def _newton(n: Any, m: Any, reduce_bias: bool) -> Any:
-    """Score, Fisher information and the (observed, if positive definite) information that scales the step."""
+    """Score, Fisher information and the (observed, if positive definite) information that scales
+    the step."""
     f11, f12, f22 = _information(m)
     # Where all detected photons have nearly one energy, the two materials cannot be told apart.
     det = max(f11 * f22 - f12 * f12, 1e-13 * f11 * f22)
@@ -114,7 +122,9 @@ def _newton(n: Any, m: Any, reduce_bias: bool) -> Any:
 
 
 @njit(cache=True, error_model="numpy")
-def _direction(u1: float, u2: float, j11: float, j12: float, j22: float, held1: bool, held2: bool) -> Any:
+def _direction(
+    u1: float, u2: float, j11: float, j12: float, j22: float, held1: bool, held2: bool
+) -> Any:
     if held1 and held2:
         return 0.0, 0.0
     if held1:
@@ -127,10 +137,22 @@ def _direction(u1: float, u2: float, j11: float, j12: float, j22: float, held1: 
 
 @njit(cache=True, error_model="numpy")
 def _iterate(
-    n: Any, scale: float, mu: Any, spectra: Any, v: Any, m: Any, a1: float, a2: float, bounds: Any, reach: Any,
-    reduce_bias: bool, tolerance: float, limit: int,
-) -> Any:  # fmt: skip
-    """Damped Newton steps from (a1, a2) inside the box ``bounds``; ends after a step shorter than ``tolerance`` SDs."""
+    n: Any,
+    scale: float,
+    mu: Any,
+    spectra: Any,
+    v: Any,
+    m: Any,
+    a1: float,
+    a2: float,
+    bounds: Any,
+    reach: Any,
+    reduce_bias: bool,
+    tolerance: float,
+    limit: int,
+) -> Any:
+    """Damped Newton steps from (a1, a2) inside the box ``bounds``; ends after a step shorter
+    than ``tolerance`` SDs."""
     f11 = f12 = f22 = 0.0
     d1 = d2 = 0.0
     best = math.inf
@@ -142,7 +164,8 @@ def _iterate(
         held1 = (a1 <= bounds[0, 0] and u1 < 0.0) or (a1 >= bounds[0, 1] and u1 > 0.0)
         held2 = (a2 <= bounds[1, 0] and u2 < 0.0) or (a2 >= bounds[1, 1] and u2 > 0.0)
         if not merit <= 2.0 * best and halvings < 6 and not (held1 or held2):
-            # Overshot: back by half the step. A little growth is no failure, as the metric F changes on the way.
+            # Overshot: back by half the step. A little growth is no failure, as the metric F
+            # changes on the way.
             halvings += 1
             d1, d2 = 0.5 * d1, 0.5 * d2
             a1, a2 = a1 - d1, a2 - d2
@@ -152,28 +175,51 @@ def _iterate(
         longest = max(abs(d1) / reach[0], abs(d2) / reach[1])
         if longest > 1.0:
             d1, d2 = d1 / longest, d2 / longest
-        # A few starved rays jump back and forth about the solution: shorten their steps more and more.
+        # A few starved rays jump back and forth about the solution: shorten their steps more and
+        # more.
         shorter = 2.0 ** (k // _PATIENCE)
         d1, d2 = d1 / shorter, d2 / shorter
         b1 = min(max(a1 + d1, bounds[0, 0]), bounds[0, 1])
         b2 = min(max(a2 + d2, bounds[1, 0]), bounds[1, 1])
         d1, d2 = b1 - a1, b2 - a2
         a1, a2 = b1, b2
-        if (d1 * d1 * f11 + 2.0 * d1 * d2 * f12 + d2 * d2 * f22) * shorter * shorter <= tolerance * tolerance:
+        if (
+            d1 * d1 * f11 + 2.0 * d1 * d2 * f12 + d2 * d2 * f22
+        ) * shorter * shorter <= tolerance * tolerance:
             return a1, a2, f11, f12, f22, k + 1
     return a1, a2, f11, f12, f22, -1
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def solve(
-    begin: int, end: int, counts: Any, column: Any, scale: Any, mu: Any, spectra: Any, coarse_mu: Any,
-    coarse_spectra: Any, air: Any, start_step: Any, start: Any, direction: Any, bounds: Any, reach: Any,
-    reduce_bias: bool, coarse_tolerance: float, tolerance: float, limit: int, out: Any, information: Any, steps: Any,
-) -> None:  # fmt: skip
+    begin: int,
+    end: int,
+    counts: Any,
+    column: Any,
+    scale: Any,
+    mu: Any,
+    spectra: Any,
+    coarse_mu: Any,
+    coarse_spectra: Any,
+    air: Any,
+    start_step: Any,
+    start: Any,
+    direction: Any,
+    bounds: Any,
+    reach: Any,
+    reduce_bias: bool,
+    coarse_tolerance: float,
+    tolerance: float,
+    limit: int,
+    out: Any,
+    information: Any,
+    steps: Any,
+) -> None:
     """Estimates for ``counts`` (bins, rays); see :func:`torchpcct.spectral.decompose.decompose`.
 
-    ``start`` (columns, nodes) tabulates the path along ``direction`` over the line integral ln(air / Σ counts), in
-    steps of ``start_step`` (columns,) from 0. ``steps``: number of Newton steps with the full spectra, −1 at the limit.
+    ``start`` (columns, nodes) tabulates the path along ``direction`` over the line integral ln(air
+    / Σ counts), in steps of ``start_step`` (columns,) from 0. ``steps``: number of Newton steps
+    with the full spectra, −1 at the limit.
     """
     bins = counts.shape[0]
     v = np.empty((6, mu.shape[1]))
@@ -188,14 +234,28 @@ def solve(
             n[b] = counts[b, i]
             total += n[b]
         p = (math.log(air[c] * s) - math.log(total + 0.5)) / start_step[c]
-        p = min(p, start.shape[1] - 1.0) if p > 0.0 else 0.0  # NaN, too, of spectra that nothing attenuates
+        # NaN, too, of spectra that nothing attenuates
+        p = min(p, start.shape[1] - 1.0) if p > 0.0 else 0.0
         k = min(int(p), start.shape[1] - 2)
         t = start[c, k] + (p - k) * (start[c, k + 1] - start[c, k])
         a1 = min(max(t * direction[0], bounds[0, 0]), bounds[0, 1])
         a2 = min(max(t * direction[1], bounds[1, 0]), bounds[1, 1])
-        # A few energies bring the estimate near, at a fraction of the cost; the full spectra then decide.
+        # A few energies bring the estimate near, at a fraction of the cost; the full spectra then
+        # decide.
         a1, a2, _, _, _, _ = _iterate(
-            n, s, coarse_mu, coarse_spectra[c], group_v, m, a1, a2, bounds, reach, reduce_bias, coarse_tolerance, 12
+            n,
+            s,
+            coarse_mu,
+            coarse_spectra[c],
+            group_v,
+            m,
+            a1,
+            a2,
+            bounds,
+            reach,
+            reduce_bias,
+            coarse_tolerance,
+            12,
         )
         a1, a2, f11, f12, f22, count = _iterate(
             n, s, mu, spectra[c], v, m, a1, a2, bounds, reach, reduce_bias, tolerance, limit
@@ -210,7 +270,15 @@ def solve(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def expected(
-    begin: int, end: int, line_integrals: Any, column: Any, scale: Any, mu: Any, spectra: Any, counts: Any, slopes: Any
+    begin: int,
+    end: int,
+    line_integrals: Any,
+    column: Any,
+    scale: Any,
+    mu: Any,
+    spectra: Any,
+    counts: Any,
+    slopes: Any,
 ) -> None:
     """λ into ``counts`` (bins, rays); λ₁, λ₂, λ₁₁, λ₁₂, λ₂₂ into ``slopes`` (5, bins, rays)."""
     bins = counts.shape[0]

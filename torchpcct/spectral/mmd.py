@@ -1,16 +1,18 @@
 """Multi-material decomposition: volume fractions of several tissues from two basis images.
 
-Mendonça, Lamb and Sahani, "A flexible method for multi-material decomposition of dual-energy CT images", IEEE Trans.
-Med. Imaging 33 (2014) 99: a voxel is an ideal mixture, whose basis coefficients are the volume-weighted means of its
-parts. Two coefficients and Σ α = 1 determine three fractions, so of all triplets of tissues one is chosen per voxel:
-the one whose triangle in the plane of coefficients holds the voxel or comes nearest. Where triangles overlap, the
-smallest one wins (the most specific explanation); a voxel outside all of them moves to the nearest point of the nearest
-triangle.
+Mendonça, Lamb and Sahani, "A flexible method for multi-material decomposition of dual-energy CT
+images", IEEE Trans. Med. Imaging 33 (2014) 99: a voxel is an ideal mixture, whose basis
+coefficients are the volume-weighted means of its parts. Two coefficients and Σ α = 1 determine
+three fractions, so of all triplets of tissues one is chosen per voxel: the one whose triangle in
+the plane of coefficients holds the voxel or comes nearest. Where triangles overlap, the smallest
+one wins (the most specific explanation); a voxel outside all of them moves to the nearest point of
+the nearest triangle.
 
-Cleaning: Li et al. name "a standard 2D k-means clustering" without its features. :func:`clean` takes the fractions and
-starts the clusters at the pure tissues, so that each keeps its name and the result does not depend on chance.
-:func:`nearest` keeps the centres there and measures distances in the two dimensions of the basis plane, in units of its
-noise: voxels at the edge of the vessel, mixed with fat, then move no centre.
+Cleaning: Li et al. name "a standard 2D k-means clustering" without its features. :func:`clean`
+takes the fractions and starts the clusters at the pure tissues, so that each keeps its name and the
+result does not depend on chance. :func:`nearest` keeps the centres there and measures distances in
+the two dimensions of the basis plane, in units of its noise: voxels at the edge of the vessel,
+mixed with fat, then move no centre.
 """
 
 from __future__ import annotations
@@ -50,22 +52,30 @@ def mmd(
     Args:
         basis_images: ``(2, ...)`` basis coefficients (dimensionless).
         basis: of the images.
-        tissues: three or more materials (or their names), or their coefficients ``(2, K)`` e.g. measured in ROIs.
-        covariance: ``(3,)`` C₁₁, C₁₂, C₂₂ of the noise: distances are then in standard deviations, which makes
-            the nearest mixture the most likely one. None: distance between the attenuations at 40…140 keV.
+        tissues: three or more materials (or their names), or their coefficients ``(2, K)`` e.g.
+            measured in ROIs.
+        covariance: ``(3,)`` C₁₁, C₁₂, C₂₂ of the noise: distances are then in standard deviations,
+            which makes the nearest mixture the most likely one. None: distance between the
+            attenuations at 40…140 keV.
 
     Returns:
-        ``(K, ...)`` fractions ≥ 0 with sum 1, at most three of them not 0; dtype of ``basis_images``.
+        ``(K, ...)`` fractions ≥ 0 with sum 1, at most three of them not 0; dtype of
+        ``basis_images``.
 
     Raises:
-        ValueError: fewer than three tissues, all of them on one line, a wrong shape, NaN or Inf in the images, a
-            covariance that is not positive definite.
+        ValueError: fewer than three tissues, all of them on one line, a wrong shape, NaN or Inf in
+            the images, a covariance that is not positive definite.
     """
     images = torch.as_tensor(basis_images)
     if images.ndim < 1 or images.shape[0] != 2 or not images.is_floating_point():
-        raise ValueError(f"basis_images must be floating-point (2, ...), got {images.dtype} {tuple(images.shape)}")
+        raise ValueError(
+            f"basis_images must be floating-point (2, ...), got {images.dtype} "
+            f"{tuple(images.shape)}"
+        )
     if not bool(torch.isfinite(images).all()):
-        raise ValueError("basis_images hold NaN or Inf: check the decomposition and the reconstruction")
+        raise ValueError(
+            "basis_images hold NaN or Inf: check the decomposition and the reconstruction"
+        )
     corners = _corners(basis, tissues)
     transform = _whitening(basis, covariance)
     corners = transform @ corners
@@ -75,7 +85,9 @@ def mmd(
     scale = max(_area(corners[:, t]) for t in triplets)
     triplets = [t for t in triplets if _area(corners[:, t]) > 1e-9 * scale]
     if not scale > 1e-12 * float((corners**2).sum()):
-        raise ValueError("the tissues lie on one line of the basis plane: three fractions cannot be told apart")
+        raise ValueError(
+            "the tissues lie on one line of the basis plane: three fractions cannot be told apart"
+        )
     best = torch.full((x.shape[1],), torch.inf, dtype=torch.float64)
     fractions = torch.zeros((count, x.shape[1]), dtype=torch.float64)
     for t in triplets:
@@ -92,10 +104,15 @@ def _corners(basis: Basis, tissues: Any) -> Any:
     if isinstance(tissues, np.ndarray | Tensor):
         c = torch.as_tensor(tissues).detach().to("cpu", torch.float64).numpy()
     else:
-        c = np.stack([basis.coefficients(t) for t in tissues], axis=1) if len(tissues) else np.zeros((2, 0))
+        c = (
+            np.stack([basis.coefficients(t) for t in tissues], axis=1)
+            if len(tissues)
+            else np.zeros((2, 0))
+        )
     if c.ndim != 2 or c.shape[0] != 2 or c.shape[1] < 3 or not np.isfinite(c).all():
         raise ValueError(
-            f"mmd needs 3 or more tissues: materials, names, or finite coefficients (2, K); got {tissues!r}"
+            "mmd needs 3 or more tissues: materials, names, or finite coefficients (2, K); got "
+            f"{tissues!r}"
         )
     return c
 
@@ -107,7 +124,10 @@ def _whitening(basis: Basis, covariance: Any) -> Any:
         return np.linalg.cholesky(mu @ mu.T).T
     c = np.asarray(covariance, np.float64)
     if c.shape != (3,) or not (c[0] > 0 and c[2] > 0 and c[0] * c[2] > c[1] ** 2):
-        raise ValueError(f"covariance must be 3 values C11, C12, C22 of a positive definite matrix, got {covariance!r}")
+        raise ValueError(
+            "covariance must be 3 values C11, C12, C22 of a positive definite matrix, got "
+            f"{covariance!r}"
+        )
     return np.linalg.cholesky(np.linalg.inv(np.array([[c[0], c[1]], [c[1], c[2]]]))).T
 
 
@@ -117,7 +137,8 @@ def _area(corners: Any) -> float:
 
 
 def _nearest(x: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
-    """Fractions ``(3, n)`` of the triangle's point nearest to each ``x`` (2, n), and the squared distance (n,)."""
+    """Fractions ``(3, n)`` of the triangle's point nearest to each ``x`` (2, n), and the squared
+    distance (n,)."""
     matrix = torch.cat([corners, torch.ones(1, 3, dtype=torch.float64)])
     target = torch.cat([x, torch.ones(1, x.shape[1], dtype=torch.float64)])
     alpha = torch.linalg.solve(matrix, target)
@@ -141,7 +162,9 @@ def _nearest(x: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
 def label(fractions: Tensor) -> Tensor:
     """Index of the largest fraction, ``(K, ...)`` → ``(...)`` int64."""
     if not fractions.is_floating_point() or not fractions.ndim:
-        raise TypeError(f"fractions must be a floating point tensor (K, ...), got {fractions.dtype}")
+        raise TypeError(
+            f"fractions must be a floating point tensor (K, ...), got {fractions.dtype}"
+        )
     return fractions.argmax(0)
 
 
@@ -152,13 +175,14 @@ def nearest(
     tissues: Sequence[Material | str] | Any = MMD_TISSUES,
     covariance: ArrayLike | None = None,
 ) -> Tensor:
-    """The pure tissue nearest to each mixture: k-means whose centres stay at the tissues, which are known.
+    """The pure tissue nearest to each mixture: k-means whose centres stay at the tissues, which are
+    known.
 
-    The largest fraction is a poor label where tissues lie nearly on one line of the basis plane: the necrotic core
-    lies 0.08 standard deviations off the line from fat to fibrous tissue (0.2 mm voxels, the exposure of the paper's
-    tables), so noise turns a core into a mixture of fat and fibrous tissue with hardly any core in it. The mixture
-    itself stays where it was; with its distance to the tissues measured in standard deviations, the nearest one is the
-    most likely.
+    The largest fraction is a poor label where tissues lie nearly on one line of the basis plane:
+    the necrotic core lies 0.08 standard deviations off the line from fat to fibrous tissue (0.2 mm
+    voxels, the exposure of the paper's tables), so noise turns a core into a mixture of fat and
+    fibrous tissue with hardly any core in it. The mixture itself stays where it was; with its
+    distance to the tissues measured in standard deviations, the nearest one is the most likely.
 
     Args:
         fractions: ``(K, ...)`` of :func:`mmd`.
@@ -173,11 +197,13 @@ def nearest(
     corners = _whitening(basis, covariance) @ _corners(basis, tissues)
     if fractions.ndim < 1 or fractions.shape[0] != corners.shape[1]:
         raise ValueError(
-            f"fractions must have {corners.shape[1]} tissues first, got the shape {tuple(fractions.shape)}"
+            f"fractions must have {corners.shape[1]} tissues first, got the shape "
+            f"{tuple(fractions.shape)}"
         )
     points = torch.from_numpy(corners)
     x = points @ fractions.detach().to(torch.float64).reshape(len(fractions), -1).cpu()
-    distance = points.square().sum(0)[:, None] - 2 * points.T @ x  # less |x|², the same for all tissues
+    # less |x|², the same for all tissues
+    distance = points.square().sum(0)[:, None] - 2 * points.T @ x
     return distance.argmin(0).reshape(fractions.shape[1:]).to(fractions.device)
 
 
@@ -189,20 +215,23 @@ def clean(fractions: Tensor) -> Tensor:
         fractions: ``(K, y, x)`` or ``(K, z, y, x)`` of :func:`mmd`.
 
     Returns:
-        ``(y, x)`` or ``(z, y, x)`` int64 labels 0…K−1 in the order of the tissues. A cluster that loses its last voxel
-        keeps its centre.
+        ``(y, x)`` or ``(z, y, x)`` int64 labels 0…K−1 in the order of the tissues. A cluster that
+        loses its last voxel keeps its centre.
 
     Raises:
         ValueError: a wrong number of axes.
     """
     if fractions.ndim not in (3, 4):
-        raise ValueError(f"fractions must be (K, y, x) or (K, z, y, x), got the shape {tuple(fractions.shape)}")
+        raise ValueError(
+            f"fractions must be (K, y, x) or (K, z, y, x), got the shape {tuple(fractions.shape)}"
+        )
     count = fractions.shape[0]
     x = fractions.detach().to(torch.float64).reshape(count, -1)
     centres = torch.eye(count, dtype=torch.float64, device=x.device)  # (clusters, K)
     labels = torch.full((x.shape[1],), -1, device=x.device)
     for _ in range(_ITERATIONS):
-        distance = centres.square().sum(1)[:, None] - 2 * centres @ x  # less |x|², the same for all clusters
+        # less |x|², the same for all clusters
+        distance = centres.square().sum(1)[:, None] - 2 * centres @ x
         new = distance.argmin(0)
         if bool((new == labels).all()):
             break

@@ -2,9 +2,9 @@
 
     λ_i(a) = s · Σ_E S_i(column, E) exp(−a₁ μ₁(E) − a₂ μ₂(E))
 
-with S the spectra that the simulator itself uses (tube, filters, the column's bowtie, detector response, tube load) and
-s the relative intensity of the detector row. Nothing is tabulated or fitted, so expected counts of the two materials
-are inverted exactly.
+with S the spectra that the simulator itself uses (tube, filters, the column's bowtie, detector
+response, tube load) and s the relative intensity of the detector row. Nothing is tabulated or
+fitted, so expected counts of the two materials are inverted exactly.
 """
 
 from __future__ import annotations
@@ -39,12 +39,14 @@ COARSE_PATH_MM = 80.0
 
 COARSE_GROUPS = 16
 _NODES = 64
-_LOWEST, _HIGHEST = -4.0, 16.0  # bounds of the estimates as line integrals at 60 keV
+_LOWEST = -4.0
+_HIGHEST = 16.0
+"""Bounds of the estimates, as line integrals at 60 keV."""
 
 _NEGLIGIBLE = 1e-12
 ONE_BIN = (100.0, 5.0)
-"""Where one bin counts this much or more, and all others together less than the second number, a ray says nothing of
-two materials: its estimate hangs on single photons."""
+"""Where one bin counts this much or more, and all others together less than the second number, a
+ray says nothing of two materials: its estimate hangs on single photons."""
 _ALIKE = 1e-7
 """Spectra of two bins that differ by less are one: their information is singular in float64."""
 
@@ -55,14 +57,15 @@ class SpectralModel:
 
     Args:
         energies: ``(E,)`` keV.
-        spectra: ``(columns, bins, E)`` expected counts of a reading in air per energy, in the central detector row.
+        spectra: ``(columns, bins, E)`` expected counts of a reading in air per energy, in the
+            central detector row.
         row_factor: ``(rows,)`` intensity of the rows relative to the central one.
         basis: the two materials; default: PE and PVC.
 
     Raises:
-        ValueError: shapes that do not fit, negative or non-finite spectra, a column without counts, fewer than 2 bins,
-            a column whose bins all have one spectrum, or of which one alone counts in air (they cannot tell two
-            materials apart).
+        ValueError: shapes that do not fit, negative or non-finite spectra, a column without counts,
+            fewer than 2 bins, a column whose bins all have one spectrum, or of which one alone
+            counts in air (they cannot tell two materials apart).
     """
 
     energies: Floats
@@ -75,29 +78,43 @@ class SpectralModel:
         spectra = reals("spectra", self.spectra)
         if spectra.ndim != 3 or energies.shape != spectra.shape[-1:]:
             raise ValueError(
-                f"spectra must have the shape (columns, bins, {energies.size} energies), got {spectra.shape}"
+                f"spectra must have the shape (columns, bins, {energies.size} energies), got "
+                f"{spectra.shape}"
             )
         if spectra.shape[1] < 2:
             raise ValueError(
-                f"two basis materials need at least 2 energy bins, got {spectra.shape[1]}: use a spectral "
+                f"two basis materials need at least 2 energy bins, got {spectra.shape[1]}: use a "
+                "spectral "
                 "detector, such as presets.pcct(mode='spectral')"
             )
-        if not (np.isfinite(spectra).all() and (spectra >= 0).all() and (spectra.sum((1, 2)) > 0).all()):
-            raise ValueError("spectra must be finite, ≥ 0 and not all 0 in any column: leave dead columns out")
+        if not (
+            np.isfinite(spectra).all() and (spectra >= 0).all() and (spectra.sum((1, 2)) > 0).all()
+        ):
+            raise ValueError(
+                "spectra must be finite, ≥ 0 and not all 0 in any column: leave dead columns out"
+            )
         if (alike := _one_spectrum(spectra)).any():
             raise ValueError(
-                f"the bins of column {int(alike.argmax())} have one spectrum but for its height, or counts in one bin "
-                "only: they cannot tell two materials apart; set other thresholds, or leave dead columns out"
+                f"the bins of column {int(alike.argmax())} have one spectrum but for its height, "
+                "or counts in one bin "
+                "only: they cannot tell two materials apart; set other thresholds, or leave dead "
+                "columns out"
             )
         if (starved := one_bin(spectra.sum(-1).T)).any():
             column = int(starved.argmax())
-            strongest, others = spectra[column].sum(-1).max(), np.sort(spectra[column].sum(-1))[:-1].sum()
+            strongest, others = (
+                spectra[column].sum(-1).max(),
+                np.sort(spectra[column].sum(-1))[:-1].sum(),
+            )
             raise ValueError(
-                f"of column {column} one bin is expected to count {strongest:.3g} photons in air and all others "
-                f"together {others:.2g}: they cannot tell two materials apart; set lower thresholds, or a higher tube "
+                f"of column {column} one bin is expected to count {strongest:.3g} photons in air "
+                "and all others "
+                f"together {others:.2g}: they cannot tell two materials apart; set lower "
+                "thresholds, or a higher tube "
                 "voltage"
             )
-        # Energies that no column detects cost time, and where the model is asked for negative lengths they matter.
+        # Energies that no column detects cost time, and where the model is asked for negative
+        # lengths they matter.
         share = (spectra / spectra.sum((1, 2), keepdims=True)).max((0, 1))
         kept = share > _NEGLIGIBLE
         set_ = object.__setattr__
@@ -106,7 +123,10 @@ class SpectralModel:
         set_(self, "row_factor", reals("row_factor", self.row_factor))
         shaped("row_factor", self.row_factor, (None,))
         if not (np.isfinite(self.row_factor).all() and (self.row_factor > 0).all()):
-            raise ValueError("row_factor must be finite and > 0: the intensity of each row relative to the central one")
+            raise ValueError(
+                "row_factor must be finite and > 0: the intensity of each row relative to the "
+                "central one"
+            )
 
     @classmethod
     def of(cls, scanner: Scanner, exposure_s: float, basis: Basis | None = None) -> SpectralModel:
@@ -114,7 +134,8 @@ class SpectralModel:
 
         Args:
             scanner: with a photon-counting detector of two bins or more.
-            exposure_s: duration of the scan in s; for a noise-free scan :data:`torchpcct.scan.NOISE_FREE_EXPOSURE_S`.
+            exposure_s: duration of the scan in s; for a noise-free scan
+                :data:`torchpcct.scan.NOISE_FREE_EXPOSURE_S`.
             basis: default PE and PVC.
 
         Raises:
@@ -122,7 +143,8 @@ class SpectralModel:
         """
         if scanner.detector.energy_integrating or scanner.detector.bins < 2:
             raise ValueError(
-                f"{scanner.name!r} reads {scanner.detector.bins} bin(s): material decomposition needs photon counts in "
+                f"{scanner.name!r} reads {scanner.detector.bins} bin(s): material decomposition "
+                "needs photon counts in "
                 "at least 2 energy bins, such as presets.pcct(mode='spectral')"
             )
         energies, weights = scanner.weights()
@@ -153,31 +175,36 @@ class SpectralModel:
     def bounds(self) -> Floats:
         """``(2, 2)`` default lowest and highest line integral of each basis material in mm.
 
-        −4…16 attenuation lengths at 60 keV: far beyond any body, so that only starved rays meet them.
+        −4…16 attenuation lengths at 60 keV: far beyond any body, so that only starved rays meet
+        them.
         """
         lengths = 1.0 / self.basis.attenuation(60.0)
         return np.outer(lengths, (_LOWEST, _HIGHEST))
 
     @cached_property
     def start(self) -> tuple[Floats, Floats, Floats, Floats]:
-        """Table of the first guess: air counts, step and path in mm over ln(air / Σ counts), direction of the path."""
+        """Table of the first guess: air counts, step and path in mm over ln(air / Σ counts),
+        direction of the path."""
         total = self.spectra.sum(1)
         air = total.sum(1)
         t = np.linspace(0.0, START_MAX_MM, 4 * _NODES)
         mu = material(START_MATERIAL).attenuation(self.energies)
         p = -np.log(total @ np.exp(-np.outer(mu, t)) / air[:, None])
         step = p[:, -1] / (_NODES - 1)
-        table = np.stack([np.interp(s * np.arange(_NODES), row, t) for s, row in zip(step, p, strict=True)])
+        table = np.stack(
+            [np.interp(s * np.arange(_NODES), row, t) for s, row in zip(step, p, strict=True)]
+        )
         direction = self.basis.coefficients(START_MATERIAL, self.energies, total.mean(0))
         return air, step, table, direction
 
     @cached_property
     def coarse(self) -> tuple[Floats, Floats]:
-        """Attenuation ``(2, G)`` and spectra ``(columns, bins, G)`` of grouped energies: fast, for the first steps.
+        """Attenuation ``(2, G)`` and spectra ``(columns, bins, G)`` of grouped energies: fast, for
+        the first steps.
 
-        Neighbouring energies share one attenuation, that of the photons behind ``COARSE_PATH_MM`` of the start
-        material; their weights make all counts behind it exact. They stay positive, so the coarse model is as well
-        behaved as the full one.
+        Neighbouring energies share one attenuation, that of the photons behind ``COARSE_PATH_MM``
+        of the start material; their weights make all counts behind it exact. They stay positive, so
+        the coarse model is as well behaved as the full one.
         """
         if self.energies.size <= COARSE_GROUPS:
             return self.attenuation, self.spectra
@@ -191,7 +218,8 @@ class SpectralModel:
         return np.ascontiguousarray(mu), np.ascontiguousarray(spectra)
 
     def cells(self, scan: Scan) -> tuple[Tensor, Tensor]:
-        """Column index and row factor of the readings stored in a scan, to broadcast to ``(views, rows, columns)``.
+        """Column index and row factor of the readings stored in a scan, to broadcast to ``(views,
+        rows, columns)``.
 
         Raises:
             ValueError: the scan has other bins, cells or air counts than this model.
@@ -199,46 +227,59 @@ class SpectralModel:
         air = torch.from_numpy(self.air)
         if tuple(scan.air.shape) != tuple(air.shape):
             raise ValueError(
-                f"the scan's air readings have the shape {tuple(scan.air.shape)}, the model's (bins, rows, columns) "
+                f"the scan's air readings have the shape {tuple(scan.air.shape)}, the model's "
+                "(bins, rows, columns) "
                 f"are {tuple(air.shape)}: build the model from the scanner of the scan"
             )
         error = float((scan.air / air - 1).abs().max())
         if error > 1e-3:
             raise ValueError(
-                f"air counts of scan and model differ by up to {100 * error:.3g} %: build the model with the scanner "
+                f"air counts of scan and model differ by up to {100 * error:.3g} %: build the "
+                "model with the scanner "
                 "of the scan and its exposure (for a noise-free scan NOISE_FREE_EXPOSURE_S)"
             )
         w = scan.window
         factor = torch.from_numpy(self.row_factor)[:, None]
         if w is None:
             return torch.arange(self.columns), factor
-        return torch.from_numpy(w.column_indices)[:, None, :], factor[w.first_row : w.first_row + w.rows]
+        return torch.from_numpy(w.column_indices)[:, None, :], factor[
+            w.first_row : w.first_row + w.rows
+        ]
 
-    def rays(self, shape: tuple[int, ...], columns: Any = None, scale: Any = None) -> tuple[Any, Any]:
+    def rays(
+        self, shape: tuple[int, ...], columns: Any = None, scale: Any = None
+    ) -> tuple[Any, Any]:
         """Column indices (int64) and intensities (float64) of rays of a shape, flat arrays.
 
         Args:
             shape: of the rays.
-            columns: whole numbers that broadcast to ``shape``; None: the last axis is the detector's columns.
+            columns: whole numbers that broadcast to ``shape``; None: the last axis is the
+                detector's columns.
             scale: relative intensities > 0 that broadcast to ``shape``; None: 1.
 
         Raises:
-            ValueError: indices outside the detector, scales ≤ 0 or not finite, shapes that do not broadcast.
+            ValueError: indices outside the detector, scales ≤ 0 or not finite, shapes that do not
+                broadcast.
         """
         if columns is None:
             if not shape or shape[-1] != self.columns:
                 raise ValueError(
-                    f"the last axis must be the detector's {self.columns} columns, got the shape {shape}: give columns"
+                    f"the last axis must be the detector's {self.columns} columns, got the shape "
+                    f"{shape}: give columns"
                 )
             columns = np.arange(self.columns)
         index = np.asarray(columns)
         if index.dtype.kind not in "iu":
             raise ValueError(f"columns must be whole numbers, got {index.dtype}")
         if index.size and not (index.min() >= 0 and index.max() < self.columns):
-            raise ValueError(f"columns must lie in 0…{self.columns - 1}, got {index.min()}…{index.max()}")
+            raise ValueError(
+                f"columns must lie in 0…{self.columns - 1}, got {index.min()}…{index.max()}"
+            )
         factor = np.asarray(1.0 if scale is None else scale, np.float64)
         if not ((factor > 0) & np.isfinite(factor)).all():
-            raise ValueError("scale must be finite and > 0: it is the relative intensity of a ray (row factor)")
+            raise ValueError(
+                "scale must be finite and > 0: it is the relative intensity of a ray (row factor)"
+            )
         # Copies: a read-only view would make numba compile its kernels once more.
         column = np.array(np.broadcast_to(index, shape), np.int64, order="C").reshape(-1)
         intensity = np.array(np.broadcast_to(factor, shape), np.float64, order="C").reshape(-1)
@@ -258,13 +299,17 @@ class SpectralModel:
             ValueError: a wrong shape, indices outside the detector.
         """
         if line_integrals.ndim < 1 or line_integrals.shape[0] != 2:
-            raise ValueError(f"line_integrals must have the shape (2, ...), got {tuple(line_integrals.shape)}")
+            raise ValueError(
+                f"line_integrals must have the shape (2, ...), got {tuple(line_integrals.shape)}"
+            )
         column, intensity = self.rays(tuple(line_integrals.shape[1:]), columns, scale)
         counts = torch.from_numpy(evaluate(self, line_integrals, column, intensity)[0])
         return counts.reshape(-1, *line_integrals.shape[1:]).to(line_integrals.dtype)
 
 
-def evaluate(model: SpectralModel, line_integrals: Tensor, column: Any, intensity: Any) -> tuple[Floats, Floats]:
+def evaluate(
+    model: SpectralModel, line_integrals: Tensor, column: Any, intensity: Any
+) -> tuple[Floats, Floats]:
     """Expected counts ``(bins, rays)`` and their derivatives, float64.
 
     The derivatives λ₁, λ₂ (per mm), λ₁₁, λ₁₂, λ₂₂ (per mm²) stand in ``(5, bins, rays)``.
@@ -273,9 +318,17 @@ def evaluate(model: SpectralModel, line_integrals: Tensor, column: Any, intensit
     counts = np.empty((model.bins, column.size))
     slopes = np.empty((5, model.bins, column.size))
     run(
-        expected, column.size, np.ascontiguousarray(a), column, intensity, model.attenuation, model.spectra, counts,
-        slopes, operations=6 * model.spectra[0].size,
-    )  # fmt: skip
+        expected,
+        column.size,
+        np.ascontiguousarray(a),
+        column,
+        intensity,
+        model.attenuation,
+        model.spectra,
+        counts,
+        slopes,
+        operations=6 * model.spectra[0].size,
+    )
     return counts, slopes
 
 
@@ -286,9 +339,11 @@ def one_bin(counts: Floats) -> NDArray[np.bool_]:
 
 
 def _one_spectrum(spectra: Floats) -> NDArray[np.bool_]:
-    """Which columns have bins that do not differ but in height, ``(columns,)``; ``spectra`` ``(columns, bins, E)``."""
+    """Which columns have bins that do not differ but in height, ``(columns,)``; ``spectra``
+    ``(columns, bins, E)``."""
     heights = spectra.sum(-1, keepdims=True)
     strongest = np.take_along_axis(spectra, heights.argmax(1)[:, None], axis=1)
-    # With the heights of the bins and not their shapes: a bin that sees next to nothing says next to nothing.
+    # With the heights of the bins and not their shapes: a bin that sees next to nothing says next
+    # to nothing.
     apart = np.abs(spectra - strongest * (heights / strongest.sum(-1, keepdims=True))).sum((1, 2))
     return np.asarray(apart <= _ALIKE * spectra.sum((1, 2)))

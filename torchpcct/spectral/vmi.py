@@ -1,10 +1,11 @@
 """Virtual monochromatic images (VMI) from basis images, their noise, and the best energy.
 
-    HU(E) = 1000 (a₁ μ₁(E) + a₂ μ₂(E) − μ_w(E)) / (μ_w(E) − μ_air(E))                       (Li et al., eq. CTE)
+    HU(E) = 1000 (a₁ μ₁(E) + a₂ μ₂(E) − μ_w(E)) / (μ_w(E) − μ_air(E))                       (Li et
+    al., eq. CTE)
 
-with μ_w of water *in the basis*: water reads 0 HU at every energy by construction, and what the basis cannot express of
-water (0.3 HU for PE and PVC) does not tint the images. A VMI is linear in the basis values, so its noise follows from
-their 2 × 2 covariance.
+with μ_w of water *in the basis*: water reads 0 HU at every energy by construction, and what the
+basis cannot express of water (0.3 HU for PE and PVC) does not tint the images. A VMI is linear in
+the basis values, so its noise follows from their 2 × 2 covariance.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ __all__ = ["VMI_ENERGIES_KEV", "VmiCurve", "vmi", "vmi_curve", "vmi_noise", "vmi
 Floats = NDArray[np.float64]
 
 _SINGULAR = 1e-5
-"""Of the product of the variances, by which rounding of float32 may push a singular covariance below 0."""
+"""Of the product of the variances, by which rounding of float32 may push a singular covariance
+below 0."""
 
 VMI_ENERGIES_KEV = tuple(float(e) for e in range(40, 141))
 
@@ -54,7 +56,9 @@ def vmi_weights(basis: Basis, energies_kev: ArrayLike = VMI_ENERGIES_KEV) -> tup
 def _pair(name: str, value: Any, entries: int) -> Tensor:
     t = torch.as_tensor(value)
     if t.ndim < 1 or t.shape[0] != entries:
-        raise ValueError(f"{name} must have {entries} entries on the first axis, got the shape {tuple(t.shape)}")
+        raise ValueError(
+            f"{name} must have {entries} entries on the first axis, got the shape {tuple(t.shape)}"
+        )
     return t if t.is_floating_point() else t.to(torch.float64)
 
 
@@ -63,7 +67,8 @@ def vmi(basis_images: Tensor, basis: Basis, energies_kev: ArrayLike = VMI_ENERGI
     """Virtual monochromatic images.
 
     Args:
-        basis_images: ``(2, ...)`` basis coefficients (dimensionless: line integrals in mm, reconstructed in mm).
+        basis_images: ``(2, ...)`` basis coefficients (dimensionless: line integrals in mm,
+            reconstructed in mm).
         basis, energies_kev: see :func:`vmi_weights`.
 
     Returns:
@@ -78,7 +83,9 @@ def vmi(basis_images: Tensor, basis: Basis, energies_kev: ArrayLike = VMI_ENERGI
 
 
 @checked
-def vmi_noise(covariance: ArrayLike, basis: Basis, energies_kev: ArrayLike = VMI_ENERGIES_KEV) -> Tensor:
+def vmi_noise(
+    covariance: ArrayLike, basis: Basis, energies_kev: ArrayLike = VMI_ENERGIES_KEV
+) -> Tensor:
     """Standard deviation of virtual monochromatic images.
 
     Args:
@@ -96,7 +103,10 @@ def vmi_noise(covariance: ArrayLike, basis: Basis, energies_kev: ArrayLike = VMI
         raise ValueError("covariance holds negative variances: pack it as C11, C12, C22")
     # Rounding may leave the determinant of a singular covariance slightly below 0.
     if not bool((c[1] ** 2 <= c[0] * c[2] * (1 + _SINGULAR)).all()):
-        raise ValueError("covariance is not that of two images (C12² > C11 · C22, or NaN): pack it as C11, C12, C22")
+        raise ValueError(
+            "covariance is not that of two images (C12² > C11 · C22, or NaN): pack it as C11, "
+            "C12, C22"
+        )
     g = torch.from_numpy(vmi_weights(basis, energies_kev)[0]).to(c)
     terms = torch.stack([g[:, 0] ** 2, 2 * g[:, 0] * g[:, 1], g[:, 1] ** 2], dim=1)
     return torch.tensordot(terms, c, dims=1).clamp_min(0).sqrt()
@@ -125,7 +135,9 @@ class VmiCurve:
         """Energy of the highest CNR: a parabola through the best sample and its neighbours."""
         k = int(self.cnr.argmax())
         if 0 < k < self.cnr.size - 1:
-            a, b = np.polyfit(self.energies[k - 1 : k + 2] - self.energies[k], self.cnr[k - 1 : k + 2], 2)[:2]
+            a, b = np.polyfit(
+                self.energies[k - 1 : k + 2] - self.energies[k], self.cnr[k - 1 : k + 2], 2
+            )[:2]
             if a < 0:
                 return float(self.energies[k] - b / (2 * a))
         return float(self.energies[k])
@@ -152,7 +164,8 @@ def vmi_curve(
     a, b, c = (np.asarray(v, np.float64) for v in (first, second, covariance))
     if a.shape != (2,) or b.shape != (2,) or c.shape != (3,):
         raise ValueError(
-            f"first and second must hold 2 coefficients, covariance 3 values, got the shapes {a.shape}, {b.shape} "
+            "first and second must hold 2 coefficients, covariance 3 values, got the shapes "
+            f"{a.shape}, {b.shape} "
             f"and {c.shape}"
         )
     det = c[0] * c[2] - c[1] ** 2

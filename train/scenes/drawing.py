@@ -83,8 +83,8 @@ class Draw:
 def draw_scene(seed: int, extent_mm: Triple, config: SceneConfig | None = None) -> TrainingScene:
     """A random scene for an inset of ``extent_mm`` = ``(z, y, x)``, outside the paper's family.
 
-    Depends on the seed and on the extent only, not on voxels. Vessels pass through the inner part of the inset, and
-    what lies in them is most often inside; bodies may be cut by its border.
+    Depends on the seed and on the extent only, not on voxels. Vessels pass through the inner part
+    of the inset, and what lies in them is most often inside; bodies may be cut by its border.
     """
     config = config if config is not None else SceneConfig()
     draw = Draw(seed)
@@ -103,10 +103,13 @@ def _draw(draw: Draw, extent: Triple, config: SceneConfig) -> TrainingScene:
         scene = _Anatomy(draw, extent, config).scene(background)
     if draw.chance(config.beside_probability):
         hu = draw(config.fat if in_muscle else config.muscle)
-        scene = replace(scene, beside=(_second_tissue(draw, extent, config, hu, scene.vessels), *scene.beside))
+        scene = replace(
+            scene, beside=(_second_tissue(draw, extent, config, hu, scene.vessels), *scene.beside)
+        )
     textured = draw.chance(config.texture_probability)
     textures = [
-        Texture(draw(config.texture_sd), draw.log(config.texture_length), draw.seed()) for _ in range(2 * textured)
+        Texture(draw(config.texture_sd), draw.log(config.texture_length), draw.seed())
+        for _ in range(2 * textured)
     ]
     motion = (0.0, 0.0)
     if draw.chance(config.motion_probability):
@@ -115,8 +118,11 @@ def _draw(draw: Draw, extent: Triple, config: SceneConfig) -> TrainingScene:
     return replace(scene, textures=tuple(textures), blur=draw(config.blur), motion=motion)
 
 
-def _second_tissue(draw: Draw, extent: Triple, config: SceneConfig, hu: float, vessels: tuple[Vessel, ...]) -> Solid:
-    """A wide ellipsoid with its face at a distance from the first vessel, or through a point of the inset."""
+def _second_tissue(
+    draw: Draw, extent: Triple, config: SceneConfig, hu: float, vessels: tuple[Vessel, ...]
+) -> Solid:
+    """A wide ellipsoid with its face at a distance from the first vessel, or through a point of
+    the inset."""
     axes, rotation = draw.axes(config.beside_size), np.array(draw.rotation()).reshape(3, 3)
     on = np.array([draw((-0.5 * e, 0.5 * e)) for e in extent[::-1]])
     if vessels:
@@ -148,8 +154,12 @@ def _towards(draw: Draw, first: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([first, second, np.cross(first, second)])
 
 
-def _free_bodies(draw: Draw, extent: Triple, config: SceneConfig, background: float) -> TrainingScene:
-    contrast = config.wide_contrast if draw.chance(config.wide_probability) else config.free_contrast
+def _free_bodies(
+    draw: Draw, extent: Triple, config: SceneConfig, background: float
+) -> TrainingScene:
+    contrast = (
+        config.wide_contrast if draw.chance(config.wide_probability) else config.free_contrast
+    )
     bodies = []
     for _ in range(draw.count(*config.free_count)):
         shape = ("ellipsoid", "superquadric", "tube")[draw.count(0, 2)]
@@ -170,16 +180,22 @@ def _free_bodies(draw: Draw, extent: Triple, config: SceneConfig, background: fl
                 kind="free",
             )
         )
-    return TrainingScene(background, solids=tuple(bodies), signal=Tissue.INSERT, around=Tissue.BACKGROUND)
+    return TrainingScene(
+        background, solids=tuple(bodies), signal=Tissue.INSERT, around=Tissue.BACKGROUND
+    )
 
 
-# -- vessels ----------------------------------------------------------------------------------------------------------
+# -- vessels ---------------------------------------------------------------------------------------
 
 
 def curve(
-    start: NDArray[np.float64], direction: NDArray[np.float64], bends: NDArray[np.float64], half: int
+    start: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    bends: NDArray[np.float64],
+    half: int,
 ) -> NDArray[np.float64]:
-    """Nodes of a smooth curve with a frame that does not twist, ``(12, 2 · half + 1)``: x, tangent, u, w.
+    """Nodes of a smooth curve with a frame that does not twist, ``(12, 2 · half + 1)``: x, tangent,
+    u, w.
 
     Args:
         start, direction: of the middle node.
@@ -218,7 +234,8 @@ def vessel_table(
     outer: tuple[NDArray[np.float64] | float, ...],
     lumen: tuple[NDArray[np.float64] | float, ...],
 ) -> NDArray[np.float64]:
-    """The table of a :class:`train.scenes.scene.Vessel` from its :func:`curve` and ``(u, w, a, b)`` of its sections."""
+    """The table of a :class:`train.scenes.scene.Vessel` from its :func:`curve` and ``(u, w, a,
+    b)`` of its sections."""
     n = line.shape[1]
     s = (np.arange(n) - n // 2) * STEP
     return np.concatenate([line, s[None], *(np.broadcast_to(v, (1, n)) for v in (*outer, *lumen))])
@@ -288,12 +305,14 @@ class _Anatomy:
             around=around,
         )
 
-    # -- courses and sections ----------------------------------------------------------------------------------------
+    # -- courses and sections ----------------------------------------------------------------------
 
     def _bumps(self, amplitude: Range, width: Range, most: int) -> NDArray[np.float64]:
         out: NDArray[np.float64] = np.zeros_like(self.s)
         for _ in range(self.draw.count(0, most)):
-            out += Bump(self.draw(amplitude), self.draw((-self.reach, self.reach)), self.draw(width))(self.s)
+            out += Bump(
+                self.draw(amplitude), self.draw((-self.reach, self.reach)), self.draw(width)
+            )(self.s)
         return out
 
     def _direction(self) -> NDArray[np.float64]:
@@ -301,15 +320,21 @@ class _Anatomy:
         if not draw.chance(c.along_z):
             return draw.direction()
         tilt, towards = math.radians(draw((0.0, c.tilt))), draw.angle()
-        return np.array([math.sin(tilt) * math.cos(towards), math.sin(tilt) * math.sin(towards), math.cos(tilt)])
+        return np.array(
+            [math.sin(tilt) * math.cos(towards), math.sin(tilt) * math.sin(towards), math.cos(tilt)]
+        )
 
-    def _course(self, start: NDArray[np.float64], direction: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
+    def _course(
+        self, start: NDArray[np.float64], direction: NDArray[np.float64], radius: float
+    ) -> NDArray[np.float64]:
         draw, c = self.draw, self.config
         strong = draw.chance(c.bend_probability)
         tightest = draw.log(c.bend_radius if strong else c.gentle_radius)
         # A tube that is wider than its bend would meet itself.
         most = 1.0 / max(tightest, 1.25 * radius)
-        bends = np.stack([self._bumps((-1.0, 1.0), (2.0, 6.0), 3) + draw((-0.5, 0.5)) for _ in range(2)], 1)
+        bends = np.stack(
+            [self._bumps((-1.0, 1.0), (2.0, 6.0), 3) + draw((-0.5, 0.5)) for _ in range(2)], 1
+        )
         size = np.hypot(*bends.T).max()
         return curve(start, direction, bends * (most / max(size, 1e-9)), self.half)
 
@@ -331,12 +356,18 @@ class _Anatomy:
         radius = 0.5 * size * (1.0 + self._bumps(c.swelling, c.bump_width, 2))
         widened: NDArray[np.float64] = np.ones_like(self.s)
         if draw.chance(c.aneurysm_probability):
-            widened += Bump(draw(c.aneurysm), draw((-self.reach, self.reach)), draw((0.8, 2.5)))(self.s)
+            widened += Bump(draw(c.aneurysm), draw((-self.reach, self.reach)), draw((0.8, 2.5)))(
+                self.s
+            )
         radius = radius * widened
         eccentric = draw.angle()
         bulge: NDArray[np.float64] = np.zeros_like(self.s)
         if draw.chance(c.bulge_probability):
-            bulge = 0.25 * size * Bump(draw(c.bulge), draw((-self.reach, self.reach)), draw((0.7, 2.5)))(self.s)
+            bulge = (
+                0.25
+                * size
+                * Bump(draw(c.bulge), draw((-self.reach, self.reach)), draw((0.7, 2.5)))(self.s)
+            )
         # The outer section grows opposite to the lumen's displacement.
         outer_angle = eccentric if bulge.any() else draw.angle()
         away = (-math.cos(eccentric), -math.sin(eccentric))
@@ -348,10 +379,15 @@ class _Anatomy:
         shift = draw(c.eccentricity) * (inner - lumen)
         lumen_aspect = draw(c.lumen_aspect) if draw.chance(0.5) else 1.0
         # Where the outer section has grown to one side, the lumen stays where it was.
-        centre = tuple(o - shift * a - bulge * a * draw((0.6, 1.0)) for o, a in zip(outer[:2], away, strict=True))
+        centre = tuple(
+            o - shift * a - bulge * a * draw((0.6, 1.0))
+            for o, a in zip(outer[:2], away, strict=True)
+        )
         table = vessel_table(line, outer, (centre[0], centre[1], lumen, lumen * lumen_aspect))
         if lumen_hu is None:
-            lumen_hu = draw(c.unenhanced_hu if draw.chance(c.unenhanced_probability) else c.lumen_hu)
+            lumen_hu = draw(
+                c.unenhanced_hu if draw.chance(c.unenhanced_probability) else c.lumen_hu
+            )
         along, across = 0.0, 0.0
         if draw.chance(c.mixing_probability):
             along, across = draw(c.mixing) / max(self.extent), draw(c.mixing)
@@ -381,7 +417,8 @@ class _Anatomy:
         start = at[:3] + sideways * (max(at[15], at[16]) + 0.5 * size + gap)
         across = draw.direction()
         direction = across - (across @ sideways) * sideways
-        # Where they are closest they run beside each other: later bends lead the second away from the first.
+        # Where they are closest they run beside each other: later bends lead the second away from
+        # the first.
         line = self._course(start, direction / np.linalg.norm(direction), 0.5 * size)
         hu = None if draw.chance(0.5) else first.vessel.lumen_hu
         return self._vessel(1, False, line, (size, size), hu)
@@ -406,10 +443,11 @@ class _Anatomy:
         table = np.concatenate([kept, beyond], axis=1)
         return replace(found, vessel=replace(found.vessel, table=table))
 
-    # -- what lies in and about them ---------------------------------------------------------------------------------
+    # -- what lies in and about them ---------------------------------------------------------------
 
     def _place(self, first: _Drawn, spread: float) -> tuple[float, float, float, float, float]:
-        """A place in the layer: s, direction, and there the radii of lumen and wall's inside, and a radius between.
+        """A place in the layer: s, direction, and there the radii of lumen and wall's inside, and a
+        radius between.
 
         ``spread`` is the largest angle to where the layer is thickest.
         """
@@ -426,7 +464,13 @@ class _Anatomy:
         edge = max(at[17] * c + at[18] * d + 0.5 * (at[19] + at[20]), 0.0)
         outer = at[13] * c + at[14] * d + self._radius(at[15], at[16], direction - v.outer_angle)
         inner = max(outer - v.wall, edge + 0.05)
-        return s, direction, float(edge), float(inner), float(edge + draw((0.3, 0.7)) * (inner - edge))
+        return (
+            s,
+            direction,
+            float(edge),
+            float(inner),
+            float(edge + draw((0.3, 0.7)) * (inner - edge)),
+        )
 
     @staticmethod
     def _radius(a: float, b: float, angle: float) -> float:
@@ -452,7 +496,11 @@ class _Anatomy:
         thickness = inner - edge
         low, high = c.core_size
         # Radial, tangential, along the vessel; wall and cap cut off what does not fit.
-        room = (max(1.3 * low, min(high, 0.8 * thickness)), max(1.3 * low, min(high, 0.9 * inner)), high)
+        room = (
+            max(1.3 * low, min(high, 0.8 * thickness)),
+            max(1.3 * low, min(high, 0.9 * inner)),
+            high,
+        )
         axes = [draw.log((low, r_)) for r_ in room]
         if shape == "crescent":
             # Wide as the vessel and around the lumen: the lumen's cap hollows it out.
@@ -501,7 +549,8 @@ class _Anatomy:
         return found
 
     def _ulcer(self, first: _Drawn) -> list[Solid]:
-        """A crater from the lumen into layer and core: a plaque that has ruptured, where it reaches a core."""
+        """A crater from the lumen into layer and core: a plaque that has ruptured, where it
+        reaches a core."""
         draw, c = self.draw, self.config
         s, direction, edge, inner, _ = self._place(first, 1.6)
         depth = min(draw.log(c.ulcer_size) * 1.5, 0.95 * max(inner - edge, 0.2))
@@ -525,7 +574,11 @@ class _Anatomy:
         s, direction, edge, _, _ = self._place(first, math.pi)
         free = draw.chance(0.25)
         at = first.vessel.at(s)
-        r = draw((0.0, 0.5)) * edge if free else edge - draw((-0.3, 0.3)) * draw.log(c.thrombus_size)
+        r = (
+            draw((0.0, 0.5)) * edge
+            if free
+            else edge - draw((-0.3, 0.3)) * draw.log(c.thrombus_size)
+        )
         u, w = r * math.cos(direction), r * math.sin(direction)
         if free:
             u, w = u + at[17], w + at[18]
@@ -552,7 +605,9 @@ class _Anatomy:
         thickness, length = draw.log(c.flap_thickness), draw((0.8, 6.0))
         c_, s_ = math.cos(direction), math.sin(direction)
         lean, turn = draw((-0.3, 0.3)), np.array(self._radial(direction)).reshape(3, 3)
-        tilt = np.array([[math.cos(lean), 0, -math.sin(lean)], [0, 1, 0], [math.sin(lean), 0, math.cos(lean)]])
+        tilt = np.array(
+            [[math.cos(lean), 0, -math.sin(lean)], [0, 1, 0], [math.sin(lean), 0, math.cos(lean)]]
+        )
         rotation = tuple(map(float, (tilt @ turn).ravel()))
         centre = (float(at[17] + r * c_), float(at[18] + r * s_), s)
         found = [
@@ -626,7 +681,14 @@ class _Anatomy:
     def _halo(self, first: _Drawn) -> Halo:
         draw, c = self.draw, self.config
         sided = draw((0.3, 1.0)) if draw.chance(0.4) else 0.0
-        return Halo(0, draw(c.halo_hu), draw.log(c.halo_width), draw.log(c.halo_softness), draw.angle(), sided)
+        return Halo(
+            0,
+            draw(c.halo_hu),
+            draw.log(c.halo_width),
+            draw.log(c.halo_softness),
+            draw.angle(),
+            sided,
+        )
 
     def _strands(self, background: float) -> list[Solid]:
         draw, c = self.draw, self.config

@@ -1,4 +1,5 @@
-"""Held-out plaques: neither random scenes nor the paper's plaque, with regions whose contrast is known."""
+"""Held-out plaques: neither random scenes nor the paper's plaque, with regions whose contrast is
+known."""
 
 from __future__ import annotations
 
@@ -26,8 +27,9 @@ class HeldOutPlaques:
         image: ``(scenes, contrasts, nz, ny, nx)`` float32, HU.
         core: ``(scenes, nz, ny, nx)`` float32, volume fraction of the core.
         core_roi: likewise, 0 or 1: voxels wholly inside the core.
-        fibrous_roi: likewise, 0 or 1: voxels at most 1.5 mm from the core that lie, with all their 26 neighbours,
-            wholly inside fibrous tissue (or, where that leaves fewer than 20, that lie wholly inside without them).
+        fibrous_roi: likewise, 0 or 1: voxels at most 1.5 mm from the core that lie, with all their
+            26 neighbours, wholly inside fibrous tissue (or, where that leaves fewer than 20, that
+            lie wholly inside without them).
         scenes: parameters at the first contrast.
     """
 
@@ -48,11 +50,13 @@ def held_out_plaques(
 ) -> HeldOutPlaques:
     """Plaques, each with several core contrasts; not the paper's, and not random ones.
 
-    Vessels of 2.6 and 4.4 mm alternate, with a superquadric or a crescent in the fibrous layer; position, orientation,
-    eccentricity and HU vary with ``seed``. The vessel's axis at z = 0 lies in the inner third of the inset.
+    Vessels of 2.6 and 4.4 mm alternate, with a superquadric or a crescent in the fibrous layer;
+    position, orientation, eccentricity and HU vary with ``seed``. The vessel's axis at z = 0 lies
+    in the inner third of the inset.
 
     Raises:
-        ValueError: an invalid grid, or one in which a ROI is empty (too coarse or too small for the plaques).
+        ValueError: an invalid grid, or one in which a ROI is empty (too coarse or too small for the
+            plaques).
     """
     shape = _checked(grid_shape)
     voxel_mm = number("voxel_mm", voxel_mm, positive=True, unit="mm")
@@ -71,27 +75,34 @@ def held_out_plaques(
             fibrous_roi = (fibrous > 0.99) & near
         if not core_roi.any() or not fibrous_roi.any():
             raise ValueError(
-                f"grid {shape} at {voxel_mm:g} mm leaves no voxel wholly inside core or fibrous tissue of "
+                f"grid {shape} at {voxel_mm:g} mm leaves no voxel wholly inside core or fibrous "
+                "tissue of "
                 f"plaque {index}: take smaller voxels or a larger inset"
             )
         each = np.stack([base + contrast * weight for contrast in contrasts])
         found.append((each, weight, core_roi.astype(np.float32), fibrous_roi.astype(np.float32)))
         scenes.append(_with_contrast(scene, contrasts[0]))
-    image, core, inside, around = (torch.from_numpy(np.stack(maps)) for maps in zip(*found, strict=True))
+    image, core, inside, around = (
+        torch.from_numpy(np.stack(maps)) for maps in zip(*found, strict=True)
+    )
     return HeldOutPlaques(image, core, inside, around, tuple(scenes))
 
 
 def _checked(shape: Any) -> tuple[int, int, int]:
     """Shape of a grid; ``ValueError`` unless it is three positive numbers."""
     if len(shape) != 3 or any(int(n) != n or n < 1 for n in shape):
-        raise ValueError(f"grid_shape must be three positive whole numbers (nz, ny, nx), got {shape!r}")
+        raise ValueError(
+            f"grid_shape must be three positive whole numbers (nz, ny, nx), got {shape!r}"
+        )
     return int(shape[0]), int(shape[1]), int(shape[2])
 
 
 def _with_contrast(scene: TrainingScene, contrast: float) -> TrainingScene:
     """The scene with another contrast of its core."""
     hu = scene.vessels[0].fibrous_hu + contrast
-    return replace(scene, cores=tuple(replace(core, contrast=contrast, hu=hu) for core in scene.cores))
+    return replace(
+        scene, cores=tuple(replace(core, contrast=contrast, hu=hu) for core in scene.cores)
+    )
 
 
 def _plaque(draw: Draw, extent: Triple, *, large: bool, crescent: bool) -> TrainingScene:
@@ -100,7 +111,8 @@ def _plaque(draw: Draw, extent: Triple, *, large: bool, crescent: bool) -> Train
     inner = 0.5 * diameter - wall
     lumen = (0.45 if large else 0.4) * inner
     eccentricity, direction, angle = draw((0.75, 0.95)), draw.angle(), draw.angle()
-    edge = lumen - eccentricity * (inner - lumen)  # far side of the lumen, seen from the axis towards the plaque
+    # far side of the lumen, seen from the axis towards the plaque
+    edge = lumen - eccentricity * (inner - lumen)
     thickness = inner - edge
     cap = 0.15
     plaque = direction + math.pi
@@ -115,7 +127,9 @@ def _plaque(draw: Draw, extent: Triple, *, large: bool, crescent: bool) -> Train
         r, exponent = edge + cap + 0.27 * thickness, 4.0
     fibrous = draw((80.0, 110.0))
     tilt = math.radians(draw((0.0, 20.0)))
-    towards = np.array([math.sin(tilt) * math.cos(angle), math.sin(tilt) * math.sin(angle), math.cos(tilt)])
+    towards = np.array(
+        [math.sin(tilt) * math.cos(angle), math.sin(tilt) * math.sin(angle), math.cos(tilt)]
+    )
     start = np.array([draw((-0.15, 0.15)) * extent[2], draw((-0.15, 0.15)) * extent[1], 0.0])
     half = math.ceil(0.75 * math.hypot(*extent) / STEP)
     line = curve(start, towards, np.zeros((2 * half + 1, 2)), half)

@@ -1,12 +1,15 @@
-"""Painter of the training scenes: tissue fractions of small cells, of tubes about curves and of superquadrics.
+"""Painter of the training scenes: tissue fractions of small cells, of tubes about curves and of
+superquadrics.
 
-Every body is a signed, approximately Euclidean distance d (negative inside) and the normal of its face. Its part of a
-cell is what a plane at that distance cuts off a cube, where d carries the term ``cell² / 24 · ∇²d`` of its own average
-over the cell: without it a ball of radius R becomes too large by ``(cell / 2 R)²``. Bodies are painted in order; each
-displaces, of the tissues that it may displace, the same proportion. So the fractions of a cell sum to 1.
+Every body is a signed, approximately Euclidean distance d (negative inside) and the normal of its
+face. Its part of a cell is what a plane at that distance cuts off a cube, where d carries the term
+``cell² / 24 · ∇²d`` of its own average over the cell: without it a ball of radius R becomes too
+large by ``(cell / 2 R)²``. Bodies are painted in order; each displaces, of the tissues that it may
+displace, the same proportion. So the fractions of a cell sum to 1.
 
-Frames, all in mm. A tube is given by nodes along a curve (:data:`train.scenes.scene.COLUMNS`). The foot of a point is
-found from the nearest node by one Newton step; ``(u, w)`` are its coordinates in the plane normal to the curve there.
+Frames, all in mm. A tube is given by nodes along a curve (:data:`train.scenes.scene.COLUMNS`). The
+foot of a point is found from the nearest node by one Newton step; ``(u, w)`` are its coordinates in
+the plane normal to the curve there.
 """
 
 from __future__ import annotations
@@ -21,7 +24,8 @@ from train.scenes.scene import Tissue
 __all__ = ["HALO", "INNER", "LUMEN", "OUTER", "QUADRIC", "QUADRIC_IN_TUBE", "STENT", "paint"]
 
 OUTER, INNER, LUMEN, QUADRIC, QUADRIC_IN_TUBE, STENT, HALO = range(7)
-"""What a body is: the wall's outside, its inside, the lumen; a superquadric, one in a tube's frame; wires; fat."""
+"""What a body is: the wall's outside, its inside, the lumen; a superquadric, one in a tube's
+frame; wires; fat."""
 FAR = 1e3
 TISSUES = len(Tissue)
 BACKGROUND = int(Tissue.BACKGROUND)
@@ -29,9 +33,11 @@ BACKGROUND = int(Tissue.BACKGROUND)
 
 @numba.njit(cache=True, fastmath=True)
 def _cut(d: float, nx: float, ny: float, nz: float, cell: float) -> float:
-    """Part of a cube of side ``cell`` that lies below a plane at the distance d of its centre, normal ``(nx, ny, nz)``.
+    """Part of a cube of side ``cell`` that lies below a plane at the distance d of its centre,
+    normal ``(nx, ny, nz)``.
 
-    The volume below a plane in the unit cube is a sum of cubes over its corners (Schwartz 1981, J. Algorithms 2).
+    The volume below a plane in the unit cube is a sum of cubes over its corners (Schwartz 1981, J.
+    Algorithms 2).
     """
     a, b, c = max(abs(nx), 1e-3), max(abs(ny), 1e-3), max(abs(nz), 1e-3)
     h = 0.5 * (a + b + c) - d / cell
@@ -47,8 +53,8 @@ def _cut(d: float, nx: float, ny: float, nz: float, cell: float) -> float:
 
 @numba.njit(cache=True, fastmath=True)
 def _ellipse(u: float, w: float, a: float, b: float, cell: float) -> Any:
-    """Distance to the ellipse of semi-axes a, b, and the unit gradient: its function over the gradient's length, plus
-    the curvature's term."""
+    """Distance to the ellipse of semi-axes a, b, and the unit gradient: its function over the
+    gradient's length, plus the curvature's term."""
     p, q = u / a, w / b
     r = np.sqrt(p * p + q * q)
     if r < 1e-6:
@@ -61,8 +67,8 @@ def _ellipse(u: float, w: float, a: float, b: float, cell: float) -> Any:
 
 @numba.njit(cache=True, fastmath=True)
 def _quadric(x: float, y: float, z: float, row: Any, cell: float) -> Any:
-    """Distance averaged over a cube of side ``cell`` about a point relative to the superquadric's centre, and the unit
-    gradient."""
+    """Distance averaged over a cube of side ``cell`` about a point relative to the superquadric's
+    centre, and the unit gradient."""
     x0 = row[3] * x + row[4] * y + row[5] * z
     x1 = row[6] * x + row[7] * y + row[8] * z
     x2 = row[9] * x + row[10] * y + row[11] * z
@@ -86,7 +92,8 @@ def _quadric(x: float, y: float, z: float, row: Any, cell: float) -> Any:
     curvature = (p - 1.0) * (c0 + c1 + c2 - (c0 * g0 * g0 + c1 * g1 * g1 + c2 * g2 * g2) / g)
     g = np.sqrt(g)
     g0, g1, g2 = s0 * g0 / g, s1 * g1 / g, s2 * g2 / g
-    # The correction is a series in cell · curvature: it means nothing where the cell is larger than the edge is round.
+    # The correction is a series in cell · curvature: it means nothing where the cell is larger than
+    # the edge is round.
     return (
         (s - 1.0) / g + min(curvature / g * cell / 24.0, 0.25) * cell,
         row[3] * g0 + row[6] * g1 + row[9] * g2,
@@ -96,11 +103,15 @@ def _quadric(x: float, y: float, z: float, row: Any, cell: float) -> Any:
 
 
 @numba.njit(cache=True, fastmath=True)
-def _foot(x: float, y: float, z: float, t: Any, tube: Any, reach: float, cell: float, out: Any) -> float:
-    """Of a point in a tube's frame; returns by how far it lies beyond ``reach``, then with ``out[0]`` FAR.
+def _foot(
+    x: float, y: float, z: float, t: Any, tube: Any, reach: float, cell: float, out: Any
+) -> float:
+    """Of a point in a tube's frame; returns by how far it lies beyond ``reach``, then with
+    ``out[0]`` FAR.
 
-    ``out``: distances to the outer section and to the lumen; u, w, s; place in the lumen (0 on its axis, 1 on its
-    border) and coordinates there; nearest node; gradients of both distances in (u, w).
+    ``out``: distances to the outer section and to the lumen; u, w, s; place in the lumen (0 on its
+    axis, 1 on its border) and coordinates there; nearest node; gradients of both distances in (u,
+    w).
     """
     out[0] = FAR
     nodes = t.shape[1]
@@ -116,7 +127,9 @@ def _foot(x: float, y: float, z: float, t: Any, tube: Any, reach: float, cell: f
     along = vx * t[3, nearest] + vy * t[4, nearest] + vz * t[5, nearest]
     # Tangents turn towards the centre of curvature, where feet crowd.
     a, b = max(nearest - 1, 0), min(nearest + 1, nodes - 1)
-    turn = (vx * (t[3, b] - t[3, a]) + vy * (t[4, b] - t[4, a]) + vz * (t[5, b] - t[5, a])) / (step * (b - a))
+    turn = (vx * (t[3, b] - t[3, a]) + vy * (t[4, b] - t[4, a]) + vz * (t[5, b] - t[5, a])) / (
+        step * (b - a)
+    )
     at = nearest + min(max(along / (max(1.0 - turn, 0.2) * step), -1.0), 1.0)
     k = min(max(int(at), 0), nodes - 2)
     f = min(max(at - k, 0.0), 1.0)
@@ -144,7 +157,11 @@ def _foot(x: float, y: float, z: float, t: Any, tube: Any, reach: float, cell: f
     du, dw = u - (r0 * t[13, k] + r1 * t[13, k + 1]), w - (r0 * t[14, k] + r1 * t[14, k + 1])
     c, s = tube[0], tube[1]
     outer, p, q = _ellipse(
-        c * du + s * dw, c * dw - s * du, r0 * t[15, k] + r1 * t[15, k + 1], r0 * t[16, k] + r1 * t[16, k + 1], cell
+        c * du + s * dw,
+        c * dw - s * du,
+        r0 * t[15, k] + r1 * t[15, k + 1],
+        r0 * t[16, k] + r1 * t[16, k + 1],
+        cell,
     )
     out[9], out[10] = c * p - s * q, s * p + c * q
     du, dw = u - (r0 * t[17, k] + r1 * t[17, k + 1]), w - (r0 * t[18, k] + r1 * t[18, k + 1])
@@ -229,11 +246,14 @@ def _fill(
                         d = max(local[v, 0], 0.0)
                         one = 0.5 * (1.0 - np.cos(np.arctan2(local[v, 3], local[v, 2]) - row[2]))
                         width = row[0] * (1.0 - row[3] * one)
-                        hu[BACKGROUND] += part[BACKGROUND] * value / (1.0 + np.exp((d - width) / row[1]))
+                        hu[BACKGROUND] += (
+                            part[BACKGROUND] * value / (1.0 + np.exp((d - width) / row[1]))
+                        )
                         continue
                     elif kind == STENT:
                         d = _wire(local[v], row)
-                        gx, gy, gz = 0.577, 0.577, 0.577  # wires are thinner than cells: of no one direction
+                        # wires are thinner than cells: of no one direction
+                        gx, gy, gz = 0.577, 0.577, 0.577
                     else:
                         gu, gw, gs = local[v, 9], local[v, 10], 0.0
                         if kind == OUTER:
@@ -246,10 +266,19 @@ def _fill(
                             value *= (1.0 + tubes[v, 5] * local[v, 4]) * mixed
                         else:
                             d, gu, gw, gs = _quadric(
-                                local[v, 2] - row[0], local[v, 3] - row[1], local[v, 4] - row[2], row, cell
+                                local[v, 2] - row[0],
+                                local[v, 3] - row[1],
+                                local[v, 4] - row[2],
+                                row,
+                                cell,
                             )
                             if row[16] > 0.0 and row[16] - local[v, 1] > d:
-                                d, gu, gw, gs = row[16] - local[v, 1], local[v, 11], local[v, 12], 0.0
+                                d, gu, gw, gs = (
+                                    row[16] - local[v, 1],
+                                    local[v, 11],
+                                    local[v, 12],
+                                    0.0,
+                                )
                         if abs(d) < cell:
                             t, n = tables[v], int(local[v, 8])
                             gx = gu * t[6, n] + gw * t[9, n] + gs * t[3, n]
@@ -258,7 +287,8 @@ def _fill(
                     if d >= cell:
                         continue
                     o = 1.0 if d <= -cell else _cut(d, gx, gy, gz, cell)
-                    # A vessel's faces are nested: what is within one is a part of what is within the one before.
+                    # A vessel's faces are nested: what is within one is a part of what is within
+                    # the one before.
                     if kind == OUTER:
                         within[v] = o
                     elif kind in (INNER, LUMEN):
@@ -283,15 +313,18 @@ def _fill(
                 out[4, k, j, i] = part[2] + part[3] + part[4] + part[5]
 
 
-def paint(shape: tuple[int, int, int], cell: float, arrays: tuple[Any, ...], signal: int, around: int) -> Any:
+def paint(
+    shape: tuple[int, int, int], cell: float, arrays: tuple[Any, ...], signal: int, around: int
+) -> Any:
     """Averages over cubic cells of a grid about the origin, ``(5, nz, ny, nx)`` float32.
 
-    Image in HU; fractions of the tissue ``signal``, of the tissue ``around``, of background and what is beside, of wall
-    and layers.
+    Image in HU; fractions of the tissue ``signal``, of the tissue ``around``, of background and
+    what is beside, of wall and layers.
 
     Args:
         shape, cell: of the grid; mm.
-        arrays: ``(tables, tubes, reaches, bodies, values, rows, background)`` of :mod:`train.scenes.rasterise`.
+        arrays: ``(tables, tubes, reaches, bodies, values, rows, background)`` of
+            :mod:`train.scenes.rasterise`.
         signal, around: tissues.
     """
     out = np.empty((5, *shape), dtype=np.float32)

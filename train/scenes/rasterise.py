@@ -25,9 +25,11 @@ from train.scenes.scene import COLUMNS, Solid, Tissue, TrainingScene
 __all__ = ["Painted", "rasterise"]
 
 CELLS = 2
-"""Cells along each edge of a voxel: at voxels of 0.2 mm, averages are within a HU rms of converged ones near faces."""
+"""Cells along each edge of a voxel: at voxels of 0.2 mm, averages are within a HU rms of
+converged ones near faces."""
 QUADRIC_COLUMNS = 17
-"""Centre (3), rows of the rotation into its own axes (9), semi-axes (3), exponent, cap to the lumen."""
+"""Centre (3), rows of the rotation into its own axes (9), semi-axes (3), exponent, cap to the
+lumen."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,9 @@ class Painted:
     around: NDArray[np.float32]
 
 
-def rasterise(scene: TrainingScene, shape: tuple[int, int, int], voxel_mm: float, cells: int = CELLS) -> Painted:
+def rasterise(
+    scene: TrainingScene, shape: tuple[int, int, int], voxel_mm: float, cells: int = CELLS
+) -> Painted:
     """A scene on a grid of cubic voxels.
 
     Args:
@@ -61,13 +65,19 @@ def rasterise(scene: TrainingScene, shape: tuple[int, int, int], voxel_mm: float
     for texture, weight in zip(scene.textures, maps[3:], strict=False):
         image = image + weight * texture.field(fine, (cell,) * 3)
     widths = (0.0, math.hypot(scene.blur, scene.motion[0]), math.hypot(scene.blur, scene.motion[1]))
-    blurred = ndimage.gaussian_filter(image, [w / cell for w in widths], mode="nearest") if any(widths) else image
+    blurred = (
+        ndimage.gaussian_filter(image, [w / cell for w in widths], mode="nearest")
+        if any(widths)
+        else image
+    )
     return Painted(*(_averaged(m, cells) for m in (image, blurred, maps[1], maps[2])))
 
 
 def _averaged(fine: NDArray[np.float32], cells: int) -> NDArray[np.float32]:
     z, y, x = (n // cells for n in fine.shape)
-    means: NDArray[np.float32] = fine.reshape(z, cells, y, cells, x, cells).mean((1, 3, 5), dtype=np.float64)
+    means: NDArray[np.float32] = fine.reshape(z, cells, y, cells, x, cells).mean(
+        (1, 3, 5), dtype=np.float64
+    )
     return means.astype(np.float32)
 
 
@@ -81,21 +91,37 @@ def _arrays(scene: TrainingScene, cell: float) -> tuple[Any, ...]:
     values: list[float] = []
     rows: list[NDArray[np.float64]] = []
 
-    def add(kind: int, vessel: int, tissue: Tissue, displaces: tuple[Tissue, ...], hu: float, row: Any = ()) -> None:
+    def add(
+        kind: int,
+        vessel: int,
+        tissue: Tissue,
+        displaces: tuple[Tissue, ...],
+        hu: float,
+        row: Any = (),
+    ) -> None:
         bodies.append((kind, vessel, int(tissue), _mask(displaces)))
         values.append(hu)
         rows.append(np.pad(np.asarray(row, dtype=np.float64), (0, QUADRIC_COLUMNS - len(row))))
 
     def solid(s: Solid) -> None:
         row = (*s.centre, *s.rotation, *s.semi_axes, s.exponent, s.cap)
-        add(QUADRIC if s.vessel < 0 else QUADRIC_IN_TUBE, s.vessel, s.tissue, s.displaces, s.hu, row)
+        add(
+            QUADRIC if s.vessel < 0 else QUADRIC_IN_TUBE, s.vessel, s.tissue, s.displaces, s.hu, row
+        )
 
     outside = (Tissue.BACKGROUND, Tissue.BESIDE, Tissue.INSERT)
     within = (Tissue.WALL, Tissue.FIBROUS, Tissue.LAYER, Tissue.CORE, Tissue.LUMEN)
     for s in scene.beside:
         solid(s)
     for h in scene.halos:
-        add(HALO, h.vessel, Tissue.BACKGROUND, (), h.hu, (h.width, 0.55 * h.softness, h.towards, h.one_sided))
+        add(
+            HALO,
+            h.vessel,
+            Tissue.BACKGROUND,
+            (),
+            h.hu,
+            (h.width, 0.55 * h.softness, h.towards, h.one_sided),
+        )
     for v, vessel in enumerate(scene.vessels):
         add(OUTER, v, Tissue.WALL, outside, vessel.wall_hu)
     for v, vessel in enumerate(scene.vessels):
@@ -113,12 +139,21 @@ def _arrays(scene: TrainingScene, cell: float) -> tuple[Any, ...]:
     reaches = [_reach(scene, v, cell) for v in range(len(scene.vessels))]
     tubes = [
         (
-            *(math.cos(v.outer_angle), math.sin(v.outer_angle), math.cos(v.lumen_angle), math.sin(v.lumen_angle)),
+            *(
+                math.cos(v.outer_angle),
+                math.sin(v.outer_angle),
+                math.cos(v.lumen_angle),
+                math.sin(v.lumen_angle),
+            ),
             *(v.wall, v.along, v.across),
         )
         for v in scene.vessels
     ]
-    tables = np.stack([v.table for v in scene.vessels]) if scene.vessels else np.empty((0, len(COLUMNS), 2))
+    tables = (
+        np.stack([v.table for v in scene.vessels])
+        if scene.vessels
+        else np.empty((0, len(COLUMNS), 2))
+    )
     return (
         tables,
         np.array(tubes, dtype=np.float64).reshape(-1, 7),
@@ -131,12 +166,17 @@ def _arrays(scene: TrainingScene, cell: float) -> tuple[Any, ...]:
 
 
 def _reach(scene: TrainingScene, number: int, cell: float) -> float:
-    """Distance from the curve beyond which a vessel and all that lies in its frame leave no trace, mm."""
+    """Distance from the curve beyond which a vessel and all that lies in its frame leave no
+    trace, mm."""
     rows = {name: scene.vessels[number].table[COLUMNS.index(name)] for name in COLUMNS[13:]}
-    outer = np.hypot(rows["outer_u"], rows["outer_w"]) + np.maximum(rows["outer_a"], rows["outer_b"])
+    outer = np.hypot(rows["outer_u"], rows["outer_w"]) + np.maximum(
+        rows["outer_a"], rows["outer_b"]
+    )
     far = [float(outer.max())]
     far += [
-        math.hypot(s.centre[0], s.centre[1]) + math.hypot(*s.semi_axes) if max(s.semi_axes) < 50.0 else 0.0
+        math.hypot(s.centre[0], s.centre[1]) + math.hypot(*s.semi_axes)
+        if max(s.semi_axes) < 50.0
+        else 0.0
         for s in (*scene.cores, *scene.solids)
         if s.vessel == number
     ]

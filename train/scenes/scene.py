@@ -1,17 +1,22 @@
-"""The 3-D scenes in HU that a learned prior is trained with: what they consist of, and how they are distributed.
+"""The 3-D scenes in HU that a learned prior is trained with: what they consist of, and how they are
+distributed.
 
-A scene (:class:`TrainingScene`) is drawn in mm and HU, without a grid (:mod:`train.scenes.drawing`);
-:mod:`train.scenes.rasterise` gives its averages over voxels, and :mod:`train.scenes.held_out` scenes of other families,
-which checkpoints are chosen by. It holds either vessels or free-standing bodies of random contrast, in fat or muscle.
+A scene (:class:`TrainingScene`) is drawn in mm and HU, without a grid
+(:mod:`train.scenes.drawing`); :mod:`train.scenes.rasterise` gives its averages over voxels, and
+:mod:`train.scenes.held_out` scenes of other families, which checkpoints are chosen by. It holds
+either vessels or free-standing bodies of random contrast, in fat or muscle.
 
-A vessel is a tube about any smooth curve in space: lumen, fibrous layer, wall; healthy or narrowed, bulging to one
-side, an aneurysm, occluded, with side branches, touching another. In it and beside it lie what disease makes: soft
-cores of both signs of contrast, ulcers, thrombi at the wall and in the lumen, dissection flaps, calcifications down to
-0.3 mm, stents, inflamed fat, strands and nodules; muscle lies at any distance from it. The plaque of the paper
-(:mod:`torchpcct.scene.plaque.plaque`) is never drawn: :func:`is_paper_family` rejects what comes close to it.
+A vessel is a tube about any smooth curve in space: lumen, fibrous layer, wall; healthy or narrowed,
+bulging to one side, an aneurysm, occluded, with side branches, touching another. In it and beside
+it lie what disease makes: soft cores of both signs of contrast, ulcers, thrombi at the wall and in
+the lumen, dissection flaps, calcifications down to 0.3 mm, stents, inflamed fat, strands and
+nodules; muscle lies at any distance from it. The plaque of the paper
+(:mod:`torchpcct.scene.plaque.plaque`) is never drawn: :func:`is_paper_family` rejects what comes
+close to it.
 
-A vessel scene without a core still has a *virtual* one where it could have been: a core of contrast 0 that leaves no
-trace in the image but has a mask, so that a loss on ROI contrast also sees true contrasts of 0.
+A vessel scene without a core still has a *virtual* one where it could have been: a core of contrast
+0 that leaves no trace in the image but has a mask, so that a loss on ROI contrast also sees true
+contrasts of 0.
 """
 
 from __future__ import annotations
@@ -46,7 +51,8 @@ WAVES = 64
 
 
 class Tissue(IntEnum):
-    """What a part of a voxel is made of; bodies are painted one after the other, and each says what it displaces."""
+    """What a part of a voxel is made of; bodies are painted one after the other, and each says
+    what it displaces."""
 
     BACKGROUND = 0
     BESIDE = 1
@@ -65,55 +71,63 @@ class Tissue(IntEnum):
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """Distribution of the scenes: ranges in mm or HU, uniform unless said otherwise, and probabilities.
+    """Distribution of the scenes: ranges in mm or HU, uniform unless said otherwise, and
+    probabilities.
 
     Args:
         fat, muscle: HU of the background; muscle_probability: of the second one.
-        free_probability: of free-standing bodies instead of vessels; free_count, free_contrast, free_size: their
-            number, contrast to the background, and semi-axes (log-uniform); wide_probability: of free bodies with
-            wide_contrast instead, like bone, air or contrast agent.
-        beside_probability: of fat beside muscle, or muscle beside fat, behind the vessels or bodies; beside_distance:
-            of its face from the wall of the first vessel; beside_size: semi-axes (log-uniform) of the ellipsoid in
-            which it lies, so large that the inset sees one gently curved border.
-        second_vessel: probability of a second vessel; touching: probability that it does; gap: distance of the walls
-            of those that do not.
-        along_z: probability that a vessel runs within ``tilt`` degrees of z; the others run in any direction.
-        bend_probability, bend_radius: of strong bends, and their radius of curvature (log-uniform); gentle_radius: of
-            all others.
-        diameter, wall, wall_hu, fibrous_hu: outer diameter, thickness and HU of the layers; plain_probability: that
-            there is no wall of its own.
-        lumen_hu, unenhanced_hu, unenhanced_probability: HU of the lumen with and without contrast agent; mixing, of
-            the probability mixing_probability: relative change of its HU over the inset along the vessel, and from
-            its axis to its border.
+        free_probability: of free-standing bodies instead of vessels; free_count, free_contrast,
+            free_size: their number, contrast to the background, and semi-axes (log-uniform);
+            wide_probability: of free bodies with wide_contrast instead, like bone, air or contrast
+            agent.
+        beside_probability: of fat beside muscle, or muscle beside fat, behind the vessels or
+            bodies; beside_distance: of its face from the wall of the first vessel; beside_size:
+            semi-axes (log-uniform) of the ellipsoid in which it lies, so large that the inset sees
+            one gently curved border.
+        second_vessel: probability of a second vessel; touching: probability that it does; gap:
+            distance of the walls of those that do not.
+        along_z: probability that a vessel runs within ``tilt`` degrees of z; the others run in any
+            direction.
+        bend_probability, bend_radius: of strong bends, and their radius of curvature (log-uniform);
+            gentle_radius: of all others.
+        diameter, wall, wall_hu, fibrous_hu: outer diameter, thickness and HU of the layers;
+            plain_probability: that there is no wall of its own.
+        lumen_hu, unenhanced_hu, unenhanced_probability: HU of the lumen with and without contrast
+            agent; mixing, of the probability mixing_probability: relative change of its HU over the
+            inset along the vessel, and from its axis to its border.
         aspect: ratio of the outer section's axes.
-        lumen_fraction, lumen_aspect, eccentricity: lumen diameter over inner diameter; ratio of its axes; displacement
-            over the largest possible one. wide_lumen, wide_fraction: probability of lumens that leave a thin layer
-            only, and their fraction.
-        narrowing, swelling: amplitudes of the Gaussians along the vessel by which the lumen narrows and the outer
-            radius varies, relative; bump_width: their standard deviation. bulge_probability, bulge: of an outer section
-            that grows to one side, and by how much of its radius. aneurysm_probability, aneurysm: of a local widening
-            of lumen and wall, relative.
+        lumen_fraction, lumen_aspect, eccentricity: lumen diameter over inner diameter; ratio of its
+            axes; displacement over the largest possible one. wide_lumen, wide_fraction: probability
+            of lumens that leave a thin layer only, and their fraction.
+        narrowing, swelling: amplitudes of the Gaussians along the vessel by which the lumen narrows
+            and the outer radius varies, relative; bump_width: their standard deviation.
+            bulge_probability, bulge: of an outer section that grows to one side, and by how much of
+            its radius. aneurysm_probability, aneurysm: of a local widening of lumen and wall,
+            relative.
         branch_probability: of a side branch; branch_ratio: its diameter over the vessel's.
         core_probability: in vessel scenes; core_counts: relative frequency of 1, 2, 3 cores.
-        core_size, core_contrast: semi-axes and magnitude of the contrast to the fibrous layer, log-uniform;
-            core_negative: probability of a negative contrast.
+        core_size, core_contrast: semi-axes and magnitude of the contrast to the fibrous layer,
+            log-uniform; core_negative: probability of a negative contrast.
         cap: smallest distance of core and lumen.
         exponent: of superquadrics ``Σ |xᵢ / aᵢ|ᵖ = 1``, log-uniform.
-        calcification_probability, calcification_hu, calcification_size: 1 to 3 of them in wall and layer; size
-            log-uniform; spotty_probability: that they are small and stand in the wall, spotty_size: then.
+        calcification_probability, calcification_hu, calcification_size: 1 to 3 of them in wall and
+            layer; size log-uniform; spotty_probability: that they are small and stand in the wall,
+            spotty_size: then.
         ulcer_probability, ulcer_size: craters of the lumen in the layer, semi-axes log-uniform.
-        thrombus_probability, thrombus_hu, thrombus_size: at the wall, or (a quarter) free in the lumen.
-        flap_probability, flap_thickness: of a dissection flap; occlusion_probability: of a lumen that is filled from
-            one place on, or over a length.
+        thrombus_probability, thrombus_hu, thrombus_size: at the wall, or (a quarter) free in the
+            lumen.
+        flap_probability, flap_thickness: of a dissection flap; occlusion_probability: of a lumen
+            that is filled from one place on, or over a length.
         stent_probability, stent_hu, stent_wire: HU and width of its wires.
-        halo_probability, halo_hu, halo_width, halo_softness: of inflamed fat about a vessel: HU above the fat, width,
-            standard deviation of its outer border.
-        strand_probability, strand_hu: of 1 to 4 strands in fat; nodule_probability, nodule_hu, nodule_size: of 1 or 2
-            nodules beside the vessel.
-        texture_probability, texture_sd, texture_length: of a Gaussian random field per tissue; length is the standard
-            deviation of its Gaussian autocorrelation, log-uniform.
-        blur, motion: standard deviations of the focal spot's blur in the plane, and of motion in one direction of the
-            plane, which motion_probability of the scenes have: what the data show is blurred, the truth is not.
+        halo_probability, halo_hu, halo_width, halo_softness: of inflamed fat about a vessel: HU
+            above the fat, width, standard deviation of its outer border.
+        strand_probability, strand_hu: of 1 to 4 strands in fat; nodule_probability, nodule_hu,
+            nodule_size: of 1 or 2 nodules beside the vessel.
+        texture_probability, texture_sd, texture_length: of a Gaussian random field per tissue;
+            length is the standard deviation of its Gaussian autocorrelation, log-uniform.
+        blur, motion: standard deviations of the focal spot's blur in the plane, and of motion in
+            one direction of the plane, which motion_probability of the scenes have: what the data
+            show is blurred, the truth is not.
     """
 
     fat: Range = (-105.0, -55.0)
@@ -203,7 +217,8 @@ class SceneConfig:
 
 @dataclass(frozen=True)
 class Bump:
-    """A Gaussian ``amplitude · exp(−(s − centre)² / 2 width²)``; mm, amplitude in mm or relative."""
+    """A Gaussian ``amplitude · exp(−(s − centre)² / 2 width²)``; mm, amplitude in mm or
+    relative."""
 
     amplitude: float
     centre: float
@@ -279,7 +294,8 @@ class Halo:
         hu: above the background.
         width: from the outer wall, mm.
         softness: standard deviation of its outer border, mm.
-        towards: direction in which it is widest, rad; one_sided: how much narrower it is on the other side, 0 … 1.
+        towards: direction in which it is widest, rad; one_sided: how much narrower it is on the
+            other side, 0 … 1.
     """
 
     vessel: int
@@ -313,8 +329,9 @@ COLUMNS = (
     "lumen_a",
     "lumen_b",
 )
-"""Rows of a vessel's table over the nodes of its centreline: position, unit tangent, two unit normals u and w that do
-not twist, way along the curve; centre and semi-axes of the outer section and of the lumen in the frame (u, w)."""
+"""Rows of a vessel's table over the nodes of its centreline: position, unit tangent, two unit
+normals u and w that do not twist, way along the curve; centre and semi-axes of the outer section
+and of the lumen in the frame (u, w)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,7 +367,8 @@ class Vessel:
 
 @dataclass(frozen=True)
 class Texture:
-    """A stationary Gaussian random field of unit variance as a sum of plane waves, times an SD in HU.
+    """A stationary Gaussian random field of unit variance as a sum of plane waves, times an SD in
+    HU.
 
     Args:
         sd: HU.
@@ -363,20 +381,31 @@ class Texture:
     seed: int
 
     def field(self, shape: tuple[int, int, int], spacing: Triple) -> NDArray[np.float32]:
-        """Voxel averages ``(nz, ny, nx)`` in HU; grids with other spacings sample the same field."""
+        """Voxel averages ``(nz, ny, nx)`` in HU; grids with other spacings sample the same
+        field."""
         rng = np.random.default_rng(self.seed)
         waves = rng.normal(size=(3, WAVES)) / self.length
         phases = np.exp(2j * np.pi * rng.random(WAVES))
         factors = []
         for n, step, k in zip(shape, spacing, waves, strict=True):
             position = (np.arange(n) - 0.5 * (n - 1)) * step
-            factors.append((np.exp(1j * np.outer(position, k)) * np.sinc(k * step / (2 * np.pi))).astype(np.complex64))
+            factors.append(
+                (np.exp(1j * np.outer(position, k)) * np.sinc(k * step / (2 * np.pi))).astype(
+                    np.complex64
+                )
+            )
         fz, fy, fx = factors
         left = ((phases.astype(np.complex64) * fz)[:, None, :] * fy[None]).reshape(-1, WAVES)
         # Re(left · fxᵀ) as one real product
-        left, right = np.concatenate([left.real, -left.imag], 1), np.concatenate([fx.real, fx.imag], 1)
+        left, right = (
+            np.concatenate([left.real, -left.imag], 1),
+            np.concatenate([fx.real, fx.imag], 1),
+        )
         # By PyTorch, whose threads a data loader limits; NumPy's BLAS has its own.
-        field = torch.from_numpy(left) @ torch.from_numpy(right * np.float32(self.sd * math.sqrt(2.0 / WAVES))).T
+        field = (
+            torch.from_numpy(left)
+            @ torch.from_numpy(right * np.float32(self.sd * math.sqrt(2.0 / WAVES))).T
+        )
         return field.numpy().reshape(shape)
 
 
@@ -388,10 +417,12 @@ class TrainingScene:
         background: HU.
         beside: bodies behind the vessels.
         vessels: painted layer by layer, so that the lumens of two that meet are one.
-        cores: bodies in the fibrous layers, virtual ones (contrast 0) included; lumens are painted over them.
+        cores: bodies in the fibrous layers, virtual ones (contrast 0) included; lumens are painted
+            over them.
         solids: bodies over the lumens, in the order of painting.
         stents, halos: of the vessels.
-        textures: of the background and what is beside, and of wall, fibrous layer and cores, or empty.
+        textures: of the background and what is beside, and of wall, fibrous layer and cores, or
+            empty.
         blur: standard deviation of the focal spot's blur in the plane, mm.
         motion: standard deviations ``(y, x)`` of a further blur, mm.
         signal: the tissue whose contrast to the tissue ``around`` it counts.
@@ -414,12 +445,16 @@ class TrainingScene:
 def is_paper_family(scene: TrainingScene) -> bool:
     """Whether a scene is close to the paper's plaque in everything that describes it.
 
-    True if some vessel has an outer diameter within 20 % of 3.36 mm and holds, maybe among others, a core of any shape
-    whose semi-axes are, in order of size, all within 30 % of 0.6, 0.985, 0.985 mm, with a contrast of −90…−30 HU.
+    True if some vessel has an outer diameter within 20 % of 3.36 mm and holds, maybe among others,
+    a core of any shape whose semi-axes are, in order of size, all within 30 % of 0.6, 0.985, 0.985
+    mm, with a contrast of −90…−30 HU.
     """
     return any(
         -90.0 <= core.contrast <= -30.0
-        and all(abs(a / b - 1.0) <= 0.3 for a, b in zip(sorted(core.semi_axes), (0.6, 0.985, 0.985), strict=True))
+        and all(
+            abs(a / b - 1.0) <= 0.3
+            for a, b in zip(sorted(core.semi_axes), (0.6, 0.985, 0.985), strict=True)
+        )
         and abs(scene.vessels[core.vessel].diameter / 3.36 - 1.0) <= 0.2
         for core in scene.cores
     )

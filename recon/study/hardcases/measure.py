@@ -1,7 +1,8 @@
-"""Every case by every method: the error against the sound scan of the same noise, its warnings, the verdict.
+"""Every case by every method: the error against the sound scan of the same noise, its warnings, the
+verdict.
 
-The error against the truth, beside that of soft FBP from the same scan, says whether a method makes a case worse than
-need be: a prior or weights that the case fools.
+The error against the truth, beside that of soft FBP from the same scan, says whether a method makes
+a case worse than need be: a prior or weights that the case fools.
 """
 
 from __future__ import annotations
@@ -48,24 +49,28 @@ from torchpcct.volume import Volume
 __all__ = ["RIGHT_NOISES", "WORSE", "Settings", "figures", "measure", "verdict"]
 
 RIGHT_NOISES = 0.5
-"""A result is right if what the case adds is at most half of the noise that the sound scan has anyway: 12 % more."""
+"""A result is right if what the case adds is at most half of the noise that the sound scan has
+anyway: 12 % more."""
 WORSE = 1.05
-"""A method that is further from the truth than soft FBP of the same scan by more than this factor has to say so."""
-_ROWS, _GRID_MM = 20, (6.4, 9.2, 9.2)
+"""A method that is further from the truth than soft FBP of the same scan by more than this
+factor has to say so."""
+_ROWS = 20
+_GRID_MM = (6.4, 9.2, 9.2)
 _COLOURS = {"right": "tab:green", "warned": "tab:orange", "unseen": "tab:grey", "SILENT": "tab:red"}
 
 
 @dataclass(frozen=True)
 class Settings(StudySettings):
-    """Settings of the hard cases; the quick ones have an eighth of the views, FBP alone, every case.
+    """Settings of the hard cases; the quick ones have an eighth of the views, FBP alone, every
+    case.
 
     Args:
         views: of the plaque's scan that is made hard, at least 120.
         exposure_s: its exposure in s.
         voxel_mm: voxel size of its inset.
         seed: of the noise, and of what is broken at random.
-        methods: of :func:`recon.reconstruct`; ``"tissues"``: MBIR with them, of some scans of the plaque. The cone beam
-            is reconstructed by FBP alone.
+        methods: of :func:`recon.reconstruct`; ``"tissues"``: MBIR with them, of some scans of the
+            plaque. The cone beam is reconstructed by FBP alone.
         cases: names of :data:`recon.study.hardcases.cases.CASES`.
     """
 
@@ -98,8 +103,8 @@ def verdict(
     worse: float = 1.0,
     unseen: str = "",
 ) -> str:
-    """``right``, ``warned`` (wrong or refused, with a message), ``unseen`` (the data cannot show it) or ``SILENT``
-    (wrong without a word).
+    """``right``, ``warned`` (wrong or refused, with a message), ``unseen`` (the data cannot show
+    it) or ``SILENT`` (wrong without a word).
 
     Args:
         error_hu: rms error in HU; None: refused.
@@ -116,19 +121,28 @@ def verdict(
     return "warned" if messages else "unseen" if unseen else "SILENT"
 
 
-def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
+def measure(
+    settings: Settings, progress: Progress = silent, folder: str | Path | None = None
+) -> Measured:
     """Reconstruct every case by every method; see :mod:`recon.study.study`.
 
-    ``rows`` of the data, one for each case and method: ``case``, ``base``, ``title``, ``method``, ``error_hu`` (rms of
-    the difference to the sound scan's volume, of another scene what it adds to the error against the truth; None if
-    refused), ``noise_hu`` (rms of the sound scan's noise), ``finite``, ``messages`` (warnings, or the refusal),
-    ``refused``, ``seconds``, ``verdict``, ``truth_hu`` (rms of the difference to the truth), ``soft_hu`` (that of soft
-    FBP from the same scan; either is None if refused).
+    ``rows`` of the data, one for each case and method: ``case``, ``base``, ``title``, ``method``,
+    ``error_hu`` (rms of the difference to the sound scan's volume, of another scene what it adds to
+    the error against the truth; None if refused), ``noise_hu`` (rms of the sound scan's noise),
+    ``finite``, ``messages`` (warnings, or the refusal), ``refused``, ``seconds``, ``verdict``,
+    ``truth_hu`` (rms of the difference to the truth), ``soft_hu`` (that of soft FBP from the same
+    scan; either is None if refused).
     """
     pieces = Pieces(folder, settings)
     used = {CASES[name].base for name in settings.cases}
-    bases = {name: make(settings, pieces.within(name), progress) for name, make in _BASES.items() if name in used}
-    sound = [(base, method) for base in bases for method in settings.methods if method in _METHODS[base]]
+    bases = {
+        name: make(settings, pieces.within(name), progress)
+        for name, make in _BASES.items()
+        if name in used
+    }
+    sound = [
+        (base, method) for base in bases for method in settings.methods if method in _METHODS[base]
+    ]
     pieces.ahead(_sound, *sound)
     for k, (name, method) in enumerate(sound):
         bases[name].sound(method)
@@ -139,7 +153,12 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
         rows += _case(settings, pieces, name, bases[CASES[name].base])
         progress("cases", (k + 1) / len(settings.cases))
     counts = Counter(row["verdict"] for row in rows)
-    data = {"rows": rows, "cases": len(settings.cases), "verdicts": dict(counts), "silent": counts["SILENT"]}
+    data = {
+        "rows": rows,
+        "cases": len(settings.cases),
+        "verdicts": dict(counts),
+        "silent": counts["SILENT"],
+    }
     return Measured(settings, data)
 
 
@@ -189,7 +208,13 @@ def _plaque_base(settings: Settings, pieces: Pieces, progress: Progress) -> _Bas
     duty = settings.views / presets.PCCT_VIEWS
 
     def simulate(scene: Scene) -> Scan:
-        return acquire(scene, scanner, region=region, duty=min(duty, 1.0), progress=lambda f: progress("simulate", f))
+        return acquire(
+            scene,
+            scanner,
+            region=region,
+            duty=min(duty, 1.0),
+            progress=lambda f: progress("simulate", f),
+        )
 
     truth_of = partial(_truth, scanner=scanner, grid=grid)
     clean = pieces("scan", partial(simulate, scene))
@@ -209,19 +234,28 @@ def _cone_base(settings: Settings, pieces: Pieces, progress: Progress) -> _Base:
     scene = balls()
     clean = pieces("scan", partial(cone_scan, scene))
     noisy = clean.with_noise(NOISE_FREE_EXPOSURE_S, settings.seed)
-    return _Base(scene, clean, noisy, CONE_GRID, cone_truth(scene), cone_scan, cone_truth, None, pieces)
+    return _Base(
+        scene, clean, noisy, CONE_GRID, cone_truth(scene), cone_scan, cone_truth, None, pieces
+    )
 
 
 _BASES = {"plaque": _plaque_base, "body": _body_base, "cone": _cone_base}
-_METHODS = {"plaque": ("fbp", "pwls", "mbir", "tissues"), "body": ("fbp", "pwls", "mbir"), "cone": ("fbp",)}
-"""That are for these scans. The object in the cone beam goes on above and below what all views see: iterative methods
-would have to put that somewhere, and say so of the sound scan, too."""
+_METHODS = {
+    "plaque": ("fbp", "pwls", "mbir", "tissues"),
+    "body": ("fbp", "pwls", "mbir"),
+    "cone": ("fbp",),
+}
+"""That are for these scans. The object in the cone beam goes on above and below what all views see:
+iterative methods would have to put that somewhere, and say so of the sound scan, too."""
 
 
 def _reconstruct(scan: Scan, grid: VolumeGrid, method: str) -> Volume:
-    """By a method of :func:`recon.reconstruct`; "tissues": MBIR with them, "soft": FBP with that kernel."""
+    """By a method of :func:`recon.reconstruct`; "tissues": MBIR with them, "soft": FBP with that
+    kernel."""
     options: Any = {"tissues": {"tissues": True}, "soft": {"kernel": "soft"}}.get(method, {})
-    return reconstruct(scan, grid, {"tissues": "mbir", "soft": "fbp"}.get(method, method), **options)
+    return reconstruct(
+        scan, grid, {"tissues": "mbir", "soft": "fbp"}.get(method, method), **options
+    )
 
 
 def _sound(settings: Settings, pieces: Pieces, name: str, method: str) -> None:
@@ -229,7 +263,9 @@ def _sound(settings: Settings, pieces: Pieces, name: str, method: str) -> None:
     _BASES[name](settings, pieces.within(name), silent).sound(method)
 
 
-def _case(settings: Settings, pieces: Pieces, name: str, base: _Base | None = None) -> list[dict[str, Any]]:
+def _case(
+    settings: Settings, pieces: Pieces, name: str, base: _Base | None = None
+) -> list[dict[str, Any]]:
     """A row for each method; without ``base``, its sound scan, this is computed or read first."""
     base = base or _BASES[CASES[name].base](settings, pieces.within(CASES[name].base), silent)
     pieces = pieces.within(f"case_{name}")
@@ -267,15 +303,19 @@ def _case(settings: Settings, pieces: Pieces, name: str, base: _Base | None = No
 
 
 def _truth(scene: Scene, scanner: Scanner, grid: VolumeGrid) -> torch.Tensor:
-    """``grid.shape`` HU of a scene at rest: each tissue reads what a rod of it does at the plaque's place."""
+    """``grid.shape`` HU of a scene at rest: each tissue reads what a rod of it does at the
+    plaque's place."""
     tissues = {b.name: b.material for b in scene.bodies if b.name in plaque_scene()[0].names}
     hu = rod_values(scene, scanner, grid.center[::-1], tissues)
     values = {name: hu.get(name, 0.0) for name in scene.names}  # what a case adds is left out
     return torch.from_numpy(scene.render(grid, values)).float()
 
 
-def _tried(scan: Scan | Exception, grid: VolumeGrid, method: str) -> tuple[Volume | None, list[str], float]:
-    """A volume, the warnings, and seconds; no volume but its message where the scan or method is refused."""
+def _tried(
+    scan: Scan | Exception, grid: VolumeGrid, method: str
+) -> tuple[Volume | None, list[str], float]:
+    """A volume, the warnings, and seconds; no volume but its message where the scan or method is
+    refused."""
     start = time.perf_counter()
     with heard("recon", "torchpcct", alone=True) as messages:
         try:
@@ -289,10 +329,17 @@ def _tried(scan: Scan | Exception, grid: VolumeGrid, method: str) -> tuple[Volum
 
 
 def _row(
-    scan: Scan | Exception, base: _Base, method: str, case: Case, truth: torch.Tensor, seen: torch.Tensor, lost: float,
+    scan: Scan | Exception,
+    base: _Base,
+    method: str,
+    case: Case,
+    truth: torch.Tensor,
+    seen: torch.Tensor,
+    lost: float,
     soft: float | None,
-) -> dict[str, Any]:  # fmt: skip
-    """A case by a method; ``seen``: the voxels that count, ``lost``: ``noise`` of :func:`verdict`."""
+) -> dict[str, Any]:
+    """A case by a method; ``seen``: the voxels that count, ``lost``: ``noise`` of
+    :func:`verdict`."""
     sound, usual, noise = base.sound(method)
     volume, texts, seconds = _tried(scan, base.grid, method)
     error_hu = truth_hu = None
@@ -307,10 +354,16 @@ def _row(
         # The standard kernel is sharper and noisier than the soft one by intent.
         worse = 1.0 if soft is None or method == "fbp" else truth_hu / soft
     return {
-        "error_hu": error_hu, "noise_hu": noise, "finite": finite, "messages": texts, "refused": volume is None,
-        "seconds": seconds, "verdict": verdict(error_hu, noise, finite, more, lost, worse, case.unseen),
-        "truth_hu": truth_hu, "soft_hu": soft,
-    }  # fmt: skip
+        "error_hu": error_hu,
+        "noise_hu": noise,
+        "finite": finite,
+        "messages": texts,
+        "refused": volume is None,
+        "seconds": seconds,
+        "verdict": verdict(error_hu, noise, finite, more, lost, worse, case.unseen),
+        "truth_hu": truth_hu,
+        "soft_hu": soft,
+    }
 
 
 def _kind(text: str) -> str:
@@ -327,7 +380,9 @@ def figures(measured: Measured) -> dict[str, Any]:
     from matplotlib.figure import Figure
 
     methods, cases = measured.settings.methods, measured.settings.cases
-    figure = Figure(figsize=(4.2 * len(methods) + 2, 0.24 * len(cases) + 1.2), dpi=150, layout="constrained")
+    figure = Figure(
+        figsize=(4.2 * len(methods) + 2, 0.24 * len(cases) + 1.2), dpi=150, layout="constrained"
+    )
     panels = figure.subplots(1, len(methods), sharey=True, squeeze=False)[0]
     for panel, method in zip(panels, methods, strict=True):
         for r in measured.data["rows"]:
@@ -335,11 +390,20 @@ def figures(measured: Measured) -> dict[str, Any]:
             if r["method"] != method:
                 continue
             if r["error_hu"] is None or not r["finite"]:
-                panel.text(0.011, k, "refused" if r["refused"] else "not finite", va="center", fontsize=7)
+                panel.text(
+                    0.011, k, "refused" if r["refused"] else "not finite", va="center", fontsize=7
+                )
             else:
-                panel.barh(k, max(r["error_hu"] / r["noise_hu"], 0.0105), color=_COLOURS[r["verdict"]], height=0.7)
+                panel.barh(
+                    k,
+                    max(r["error_hu"] / r["noise_hu"], 0.0105),
+                    color=_COLOURS[r["verdict"]],
+                    height=0.7,
+                )
         panel.axvline(RIGHT_NOISES, color="black", linewidth=0.8, linestyle=":")
-        panel.set(xscale="log", xlim=(0.01, None), xlabel="error / noise of the sound scan", title=method)
+        panel.set(
+            xscale="log", xlim=(0.01, None), xlabel="error / noise of the sound scan", title=method
+        )
     panels[0].set_yticks(range(len(cases)), [CASES[name].title for name in cases], fontsize=7)
     panels[0].invert_yaxis()
     return {"hardcases.png": figure}

@@ -1,8 +1,9 @@
-"""The figures of the paper that this package reproduces, and the tolerances that we hold ourselves to.
+"""The figures of the paper that this package reproduces, and the tolerances that we hold ourselves
+to.
 
-Source: Li, Wu, Pack, Wu, De Man, Wang, Nieman, Wang, "Coronary Atherosclerotic Plaque Characterization with
-Photon-counting CT: a Simulation-based Feasibility Study", tables "Statistics on the means of the ROI over 10
-realizations" and "Necrotic core detectability measured as the CNR".
+Source: Li, Wu, Pack, Wu, De Man, Wang, Nieman, Wang, "Coronary Atherosclerotic Plaque
+Characterization with Photon-counting CT: a Simulation-based Feasibility Study", tables "Statistics
+on the means of the ROI over 10 realizations" and "Necrotic core detectability measured as the CNR".
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ __all__ = [
 ]
 
 FULL_VIEWS = {"PCCT": presets.PCCT_VIEWS, "EID-CT": presets.EID_VIEWS}
-"""Views per rotation, by the scanner's name. A study with fewer views stands for the same scan, thinned out."""
+"""Views per rotation, by the scanner's name. A study with fewer views stands for the same scan,
+thinned out."""
 
 ROTATION_S = 0.35
 
@@ -44,8 +46,8 @@ DOSES = {"1x": ROTATION_S, "2x": 0.70, "5.7x": 2.00, "8x": 2.80}
 """Exposure (one rotation) in s of each dose level, at 1000 mA."""
 
 TABLE_EXPOSURE_S = 2.00
-"""Exposure of both tables. The paper does not state it; the text of its noise section and the size of its standard
-deviations point to the assumed 5.7× dose (an inference of ours)."""
+"""Exposure of both tables. The paper does not state it; the text of its noise section and the size
+of its standard deviations point to the assumed 5.7× dose (an inference of ours)."""
 
 REALIZATIONS = 10
 
@@ -85,24 +87,25 @@ SPECTRAL = {
     "core_visible_up_to": 0.25,
     "core_lost_at": 1.0,
 }
-"""Spectral characterisation: best energy for core against fibrous tissue (our tolerance: predictions move by 48–56 keV
-with the assumed filtration), and the noise levels up to which tissue maps show the core and at which they do not."""
+"""Spectral characterisation: best energy for core against fibrous tissue (our tolerance:
+predictions move by 48–56 keV with the assumed filtration), and the noise levels up to which tissue
+maps show the core and at which they do not."""
 
 BOWTIE: dict[str, Any] = {
     "skin_reduction_percent": 55.0,
     "total_dose_factor": 8.0,
 }
-"""Dose study: what the ROI bowtie saves in the thorax's skin, and the factor claimed for denoising and bowtie together;
-its other figures stand in the template of the study's report."""
+"""Dose study: what the ROI bowtie saves in the thorax's skin, and the factor claimed for denoising
+and bowtie together; its other figures stand in the template of the study's report."""
 
 RESOLUTION: dict[str, Any] = {
     "last_kernels_px": (3.75, 5.0),
     "cap_limit_px": 3.75,
     "final_fwhm_mm": 0.43,
 }
-"""Resolution study, in pixels of 0.035 mm: the Gaussian kernels up to which the core's boundary is clear; the kernel
-that the cap's thickness (20 % error) does not allow any more; and the final resolution recommended in mm,
-which implies a system of √(0.43² − 0.31²) = 0.30 mm."""
+"""Resolution study, in pixels of 0.035 mm: the Gaussian kernels up to which the core's boundary is
+clear; the kernel that the cap's thickness (20 % error) does not allow any more; and the final
+resolution recommended in mm, which implies a system of √(0.43² − 0.31²) = 0.30 mm."""
 
 MOTION: dict[str, Any] = {
     "fractions": (0.1, 0.2, 0.4, 0.6, 1.0),
@@ -110,27 +113,50 @@ MOTION: dict[str, Any] = {
     "tolerated": 0.2,
     "lumen_stable_below": 0.4,
 }
-"""Motion study: residual motions shown for PCCT and EID-CT, of 2 mm; the largest that is tolerated; and the one below
-which the lumen's area does not suffer much."""
+"""Motion study: residual motions shown for PCCT and EID-CT, of 2 mm; the largest that is tolerated;
+and the one below which the lumen's area does not suffer much."""
 
 MATERIALS: Mapping[str, tuple[float, float, Mapping[str, float]]] = {
-    "vessel_wall": (1.074, 60.0, {"H": 0.1040, "C": 0.1818, "N": 0.0368, "O": 0.6739, "P": 0.0011, "Ca": 0.0024}),
+    "vessel_wall": (
+        1.074,
+        60.0,
+        {"H": 0.1040, "C": 0.1818, "N": 0.0368, "O": 0.6739, "P": 0.0011, "Ca": 0.0024},
+    ),
     "fibrous_tissue": (1.113, 100.0, {"H": 0.1089, "C": 0.1378, "N": 0.0178, "O": 0.7355}),
     "necrotic_core": (1.055, 40.0, {"H": 0.1083, "C": 0.1737, "N": 0.0217, "O": 0.6963}),
     "blood_iodine": (
         1.060,
         500.0,
-        {"H": 0.1010, "C": 0.1089, "N": 0.0327, "O": 0.7376, "Na": 0.0010, "P": 0.0010, "S": 0.0020, "Cl": 0.0030,
-         "K": 0.0020, "Fe": 0.0010, "I": 0.0100},
+        {
+            "H": 0.1010,
+            "C": 0.1089,
+            "N": 0.0327,
+            "O": 0.7376,
+            "Na": 0.0010,
+            "P": 0.0010,
+            "S": 0.0020,
+            "Cl": 0.0030,
+            "K": 0.0020,
+            "Fe": 0.0010,
+            "I": 0.0100,
+        },
     ),
     "pericoronary_fat": (
         0.950,
         -100.0,
-        {"H": 0.1140, "C": 0.5980, "N": 0.0070, "O": 0.2780, "Na": 0.0010, "S": 0.0010, "Cl": 0.0010},
+        {
+            "H": 0.1140,
+            "C": 0.5980,
+            "N": 0.0070,
+            "O": 0.2780,
+            "Na": 0.0010,
+            "S": 0.0010,
+            "Cl": 0.0010,
+        },
     ),
-}  # fmt: skip
-"""Phantom: tissue → density in g/cm³, CT number in HU at 100 kVp, mass fractions. The spectrum of the CT numbers is not
-stated. The fractions of blood sum to 1.0002."""
+}
+"""Phantom: tissue → density in g/cm³, CT number in HU at 100 kVp, mass fractions. The spectrum of
+the CT numbers is not stated. The fractions of blood sum to 1.0002."""
 
 PHANTOM_MM: Mapping[str, float] = {
     "core, major axis": 1.97,

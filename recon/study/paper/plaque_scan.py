@@ -1,4 +1,5 @@
-"""What the studies of the plaque share: grids, ROIs, the noise-free scan and its FBP, what is read off an image."""
+"""What the studies of the plaque share: grids, ROIs, the noise-free scan and its FBP, what is
+read off an image."""
 
 from __future__ import annotations
 
@@ -16,7 +17,13 @@ from recon.evaluate.store import Pieces
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.placement import RoiPair, place_rois
-from torchpcct.metrics.plaque_measures import PlaqueSegmentation, basin_depth, cap_on_line, dice, segment_plaque
+from torchpcct.metrics.plaque_measures import (
+    PlaqueSegmentation,
+    basin_depth,
+    cap_on_line,
+    dice,
+    segment_plaque,
+)
 from torchpcct.metrics.roi import axial_grid
 from torchpcct.scan import Scan
 from torchpcct.scanner import Scanner, presets
@@ -62,14 +69,16 @@ def inset_grid(plaque: Plaque, voxel_mm: float) -> VolumeGrid:
 
 
 def duty(scanner: Scanner, full_views: int) -> float:
-    """Share of a view's time with the beam on: fewer views than ``full_views`` stand for the same scan, thinned out."""
+    """Share of a view's time with the beam on: fewer views than ``full_views`` stand for the
+    same scan, thinned out."""
     return min(1.0, scanner.geometry.views / full_views)
 
 
 def equal_dose(scanner: Scanner) -> float:
     """Exposure of a scanner over that of the PCCT at equal dose: equal fluence at the isocentre.
 
-    The spectrum in front of the patient is the same, so it falls with the square of the tube's distance."""
+    The spectrum in front of the patient is the same, so it falls with the square of the tube's
+    distance."""
     return float((scanner.geometry.sod / presets.pcct(8).geometry.sod) ** 2)
 
 
@@ -93,7 +102,8 @@ class PlaqueScan:
     fbp: InsetFbp
 
     def roi_means(self, volumes: Sequence[Tensor]) -> NDArray[np.float64]:
-        """``(S, 2)`` HU, the two ROI means of what ``fbp`` gives: all grids and kernels, the grid varying slowest."""
+        """``(S, 2)`` HU, the two ROI means of what ``fbp`` gives: all grids and kernels, the
+        grid varying slowest."""
         return np.array(
             [
                 [float(roi(volume)) for roi in pair]
@@ -112,7 +122,8 @@ def prepare(
     progress: Callable[[float], None] | None = None,
     pieces: Pieces | None = None,
 ) -> PlaqueScan:
-    """Simulate the noise-free scan of a plaque in its scene and place grids and ROIs; ``pieces`` keep the scan.
+    """Simulate the noise-free scan of a plaque in its scene and place grids and ROIs; ``pieces``
+    keep the scan.
 
     Raises:
         ValueError: ROIs that come out empty; an inset outside the field of view.
@@ -124,12 +135,17 @@ def prepare(
     region = enclosing([*grids, fine])
     on = duty(scanner, full_views)
     keep = pieces or Pieces(None, None)
-    clean = keep("scan", lambda: acquire(bodies, scanner, region=region, duty=on, progress=progress))
-    return PlaqueScan(clean, fine, grids, [rois.on(g) for g in grids], rois, InsetFbp(clean, grids, kernels))
+    clean = keep(
+        "scan", lambda: acquire(bodies, scanner, region=region, duty=on, progress=progress)
+    )
+    return PlaqueScan(
+        clean, fine, grids, [rois.on(g) for g in grids], rois, InsetFbp(clean, grids, kernels)
+    )
 
 
 def reference_fbp(scan: Scan, grid: VolumeGrid, motion: Any = None) -> Tensor:
-    """FBP with the reference kernel, ``(z, y, x)`` HU; ``motion``: of :class:`recon.analytic.inset.InsetFbp`."""
+    """FBP with the reference kernel, ``(z, y, x)`` HU; ``motion``: of
+    :class:`recon.analytic.inset.InsetFbp`."""
     return InsetFbp(scan, [grid], [REFERENCE_KERNEL], motion=motion)(scan)[0][0]
 
 
@@ -139,13 +155,17 @@ def enclosing(grids: list[VolumeGrid]) -> VolumeGrid:
     return VolumeGrid((1, 1, 1), extent, grids[0].center)
 
 
-# --- what each tissue reads ------------------------------------------------------------------------------------------
+# --- what each tissue reads -----------------------------------------------------------------------
 
 
-_ROWS, _ROD_VIEWS = 12, 60
-"""Detector rows about the middle and views per turn: more do not change what the middle slices read."""
-_ROD_MM, _LENGTH_MM = 4.0, 8.0
-_READ_SLICES, _ROD_VOXEL_MM = 3, 0.25
+_ROWS = 12
+_ROD_VIEWS = 60
+"""Detector rows about the middle and views per turn: more do not change what the middle slices
+read."""
+_ROD_MM = 4.0
+_LENGTH_MM = 8.0
+_READ_SLICES = 3
+_ROD_VOXEL_MM = 0.25
 _MARGIN_MM = 1.0
 """What is read keeps this far from the rod's edge: beyond the reach of every kernel's blur."""
 
@@ -155,17 +175,19 @@ def rod_values(
 ) -> dict[str, float]:
     """True values of tissues: the HU of a rod of each at the plaque's place, tissue → HU.
 
-    The true value of a tissue in HU is a matter of definition: it hinges on the spectrum that arrives behind the
-    patient and on the scanner's water correction. A least-squares fit of all tissues to one scan of the plaque has to
-    tell thin layers apart and moves by tens of HU with what it takes the fat for. A rod of the tissue alone, at the
-    same place in the same patient, is large enough for the plateau of its FBP image (standard kernel) to be read
-    directly: no fit, no edges, no noise.
+    The true value of a tissue in HU is a matter of definition: it hinges on the spectrum that
+    arrives behind the patient and on the scanner's water correction. A least-squares fit of all
+    tissues to one scan of the plaque has to tell thin layers apart and moves by tens of HU with
+    what it takes the fat for. A rod of the tissue alone, at the same place in the same patient, is
+    large enough for the plateau of its FBP image (standard kernel) to be read directly: no fit, no
+    edges, no noise.
 
-    Rods of 3, 4 and 6 mm agree within 0.03 HU but for blood with iodine, which hardens its own beam and reads 1.2 HU
-    less per mm of diameter: rods are about as thick as the vessel.
+    Rods of 3, 4 and 6 mm agree within 0.03 HU but for blood with iodine, which hardens its own beam
+    and reads 1.2 HU less per mm of diameter: rods are about as thick as the vessel.
 
     Args:
-        scene: its first body is the patient, a cylinder about the scanner's axis, which stays as it is.
+        scene: its first body is the patient, a cylinder about the scanner's axis, which stays as it
+            is.
         scanner: of the study; its views are thinned out.
         position: ``(x, y, ...)`` mm of the plaque, e.g. ``Plaque.position``.
         tissues: name → material.
@@ -186,7 +208,9 @@ def rod_values(
     shape = EllipticCylinder(radius, _LENGTH_MM / 2, position=(x, y, 0.0))
     hu = {}
     for name, material in tissues.items():
-        rod = Scene([replace(scene.bodies[0], name="patient"), Body("rod", shape, material, "patient")])
+        rod = Scene(
+            [replace(scene.bodies[0], name="patient"), Body("rod", shape, material, "patient")]
+        )
         scan = acquire(rod, device, region=region, duty=count / g.views)
         hu[str(name)] = float(reference_fbp(scan, grid).double().numpy()[read].mean())
     return hu
@@ -205,7 +229,8 @@ class Truth:
     Attributes:
         image: the axial image, ``(1, y, x)``.
         masks: ``"lumen"`` and ``"core"`` → ``(y, x)`` bool, where they are.
-        line: ``(y, x)`` mm of the lumen's and of the core's centre: the line on which the cap is measured.
+        line: ``(y, x)`` mm of the lumen's and of the core's centre: the line on which the cap is
+            measured.
     """
 
     image: VolumeGrid
@@ -233,9 +258,10 @@ class PlaqueImage:
     Attributes:
         image: ``(y, x)`` HU.
         segmentation: of it.
-        measures: JSON values: ``lumen_mm2``, ``core_mm2``: areas; ``core_found``; ``cap_line_mm``: cap thickness on the
-            line from the lumen's to the core's centre, NaN where there is no lumen; ``lumen_dice``, ``core_dice``:
-            overlap of the segmented regions with the true ones; ``basin_depth_hu``: of the core's basin
+        measures: JSON values: ``lumen_mm2``, ``core_mm2``: areas; ``core_found``; ``cap_line_mm``:
+            cap thickness on the line from the lumen's to the core's centre, NaN where there is no
+            lumen; ``lumen_dice``, ``core_dice``: overlap of the segmented regions with the true
+            ones; ``basin_depth_hu``: of the core's basin
             (:func:`torchpcct.metrics.plaque_measures.basin_depth`); and what a study adds.
     """
 
@@ -248,7 +274,8 @@ class PlaqueImage:
 
 
 def measure_plaque(image: Tensor, truth: Truth, **more: Any) -> PlaqueImage:
-    """Segment and measure an axial image ``(y, x)`` HU on ``truth.image``; ``more``: measures of the study's own."""
+    """Segment and measure an axial image ``(y, x)`` HU on ``truth.image``; ``more``: measures of
+    the study's own."""
     found = segment_plaque(image, truth.image)
     measures = {
         "lumen_mm2": found.lumen_area,

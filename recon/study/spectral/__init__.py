@@ -1,4 +1,5 @@
-"""The plaque in energy bins: ``scan`` (and tissue maps), ``calibration`` (wrong ones), ``measure`` (the study)."""
+"""The plaque in energy bins: ``scan`` (and tissue maps), ``calibration`` (wrong ones),
+``measure`` (the study)."""
 
 from recon.study.spectral.measure import Settings, checks, figures, measure
 

@@ -1,4 +1,5 @@
-"""What a wrong calibration of the decomposition costs: noise-free scans decomposed with a model that is not theirs."""
+"""What a wrong calibration of the decomposition costs: noise-free scans decomposed with a model
+that is not theirs."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ from torchpcct.spectral import (
 __all__ = ["SHOWN_KEV", "CalibrationError", "calibration_cases", "calibration_costs", "decomposed"]
 
 SHOWN_KEV = (52.0, 70.0)
-"""Energies at which wrong calibrations are compared: the paper's best, and one where contrasts are usual."""
+"""Energies at which wrong calibrations are compared: the paper's best, and one where contrasts
+are usual."""
 _PURE = 0.999
 
 
@@ -33,11 +35,11 @@ _PURE = 0.999
 class CalibrationError:
     """How a calibration is wrong: a decomposition knows tube, filters and detector only by it.
 
-    The scan is always the true one and the model is wrong, never the other way round. Thresholds lower than assumed
-    are the energy axis of a counting detector: pulse heights drift with the electronics' gain and offset. These and a
-    softer spectrum are seen by the air scan of every calibration, which sets the assumed counts in air to the measured
-    ones bin by bin; what is left is the wrong *shape* of the spectra. Without that scan the error is larger: both are
-    given.
+    The scan is always the true one and the model is wrong, never the other way round. Thresholds
+    lower than assumed are the energy axis of a counting detector: pulse heights drift with the
+    electronics' gain and offset. These and a softer spectrum are seen by the air scan of every
+    calibration, which sets the assumed counts in air to the measured ones bin by bin; what is left
+    is the wrong *shape* of the spectra. Without that scan the error is larger: both are given.
 
     Args:
         name: in tables.
@@ -46,8 +48,8 @@ class CalibrationError:
         gain: relative error of the counts since the air scan.
         bin: the energy bin that has it; None: all.
         air_scan: whether the assumed counts in air are those that the true scanner measures.
-        transported: whether the scan's photons interact more than once: 1, and the decomposition does not know: 2, and
-            it does, from other photons; 0: they do not.
+        transported: whether the scan's photons interact more than once: 1, and the decomposition
+            does not know: 2, and it does, from other photons; 0: they do not.
     """
 
     name: str
@@ -73,24 +75,37 @@ def calibration_cases(s: Any, bins: int) -> list[CalibrationError]:
     errors = [
         CalibrationError("none"),
         CalibrationError(f"thresholds {kev:g} keV lower", threshold_kev=kev),
-        CalibrationError(f"thresholds {kev:g} keV lower, no air scan", threshold_kev=kev, air_scan=False),
+        CalibrationError(
+            f"thresholds {kev:g} keV lower, no air scan", threshold_kev=kev, air_scan=False
+        ),
         CalibrationError(f"tube voltage {kv:g} kV lower", voltage_kv=kv),
-        CalibrationError(f"tube voltage {kv:g} kV lower, no air scan", voltage_kv=kv, air_scan=False),
+        CalibrationError(
+            f"tube voltage {kv:g} kV lower, no air scan", voltage_kv=kv, air_scan=False
+        ),
         CalibrationError(f"{100 * gain:g} % more counts in all bins", gain=gain),
     ]
-    errors += [CalibrationError(f"{100 * gain:g} % more counts in bin {k + 1}", gain=gain, bin=k) for k in range(bins)]
+    errors += [
+        CalibrationError(f"{100 * gain:g} % more counts in bin {k + 1}", gain=gain, bin=k)
+        for k in range(bins)
+    ]
     if s.transport_photons:
         errors += [
             CalibrationError("photons interact repeatedly", transported=1),
-            CalibrationError("photons interact repeatedly, no air scan", transported=1, air_scan=False),
-            CalibrationError("photons interact repeatedly, known from other photons", transported=2),
+            CalibrationError(
+                "photons interact repeatedly, no air scan", transported=1, air_scan=False
+            ),
+            CalibrationError(
+                "photons interact repeatedly, known from other photons", transported=2
+            ),
         ]
     return errors
 
 
-def decomposed(scan: SpectralScan, error: CalibrationError, calibrated: Scanner) -> tuple[Tensor, float]:
-    """Noise-free basis images of the true scan, ``(2, z, y, x)``, and the share of its rays that found no solution;
-    ``calibrated``: the scanner that the decomposition knew before the error."""
+def decomposed(
+    scan: SpectralScan, error: CalibrationError, calibrated: Scanner
+) -> tuple[Tensor, float]:
+    """Noise-free basis images of the true scan, ``(2, z, y, x)``, and the share of its rays that
+    found no solution; ``calibrated``: the scanner that the decomposition knew before the error."""
     model = SpectralModel.of(error.assumed(calibrated), NOISE_FREE_EXPOSURE_S)
     air = torch.from_numpy(model.air).to(scan.clean.air)
     factor = air / scan.clean.air if error.air_scan else torch.ones_like(air)
@@ -99,18 +114,25 @@ def decomposed(scan: SpectralScan, error: CalibrationError, calibrated: Scanner)
     assert true.surround is not None
     counts = true.counts * scan.window.take(factor).to(true.counts)
     # The model's own counts in air, so that it takes the scan for its own.
-    believed = replace(true, counts=counts, surround=true.surround * factor.to(true.surround), air=air)
+    believed = replace(
+        true, counts=counts, surround=true.surround * factor.to(true.surround), air=air
+    )
     found = decompose_scan(believed, model, tolerance=1e-3)
-    fbp = InsetFbp(true, [scan.grid], [scan.settings.kernel], surround=decompose_surround(believed, model))
+    fbp = InsetFbp(
+        true, [scan.grid], [scan.settings.kernel], surround=decompose_surround(believed, model)
+    )
     return fbp.images(found.line_integrals)[0][0], float((~found.converged).double().mean())
 
 
-def calibration_costs(s: Any, tissues: Tissues, progress: Callable[[float], None]) -> dict[str, Any]:
-    """HU of the tissues, contrast and tissue maps with every wrong calibration; the noise of the study's own scan, of
-    which ``tissues`` are, is the unit of the maps' distances.
+def calibration_costs(
+    s: Any, tissues: Tissues, progress: Callable[[float], None]
+) -> dict[str, Any]:
+    """HU of the tissues, contrast and tissue maps with every wrong calibration; the noise of the
+    study's own scan, of which ``tissues`` are, is the unit of the maps' distances.
 
     Returns:
-        JSON values: ``cases``, one row per error (the first is none) with HU by energy and tissue, contrast, Dice, and
+        JSON values: ``cases``, one row per error (the first is none) with HU by energy and tissue,
+            contrast, Dice, and
         their costs, the difference to the first.
     """
     few = replace(s, views=s.calibration_views)
@@ -121,29 +143,43 @@ def calibration_costs(s: Any, tissues: Tissues, progress: Callable[[float], None
         silicon = TransportedSilicon("spectral", photons=s.transport_photons, transport_seed=s.seed)
         scans[1] = SpectralScan(few, lambda f: progress(0.3 + 0.3 * f), silicon, full)
     plain = scans[0].scanner
-    other = plain.replace(detector=replace(silicon, transport_seed=s.seed + 1)) if s.transport_photons else plain
+    other = (
+        plain.replace(detector=replace(silicon, transport_seed=s.seed + 1))
+        if s.transport_photons
+        else plain
+    )
     errors, rows = calibration_cases(s, plain.detector.bins), []
     for k, error in enumerate(errors):
-        scan, calibrated = scans[min(error.transported, 1)], other if error.transported == 2 else plain
+        scan, calibrated = (
+            scans[min(error.transported, 1)],
+            other if error.transported == 2 else plain,
+        )
         images, failed = decomposed(scan, error, calibrated)
         rows.append({**asdict(error), "failed": failed, **_read(scan, tissues, images)})
         progress(0.6 + 0.4 * (k + 1) / len(errors))
     base = rows[0]
     for row in rows:
-        row["cost_hu"] = {e: {t: v - base["hu"][e][t] for t, v in hu.items()} for e, hu in row["hu"].items()}
+        row["cost_hu"] = {
+            e: {t: v - base["hu"][e][t] for t, v in hu.items()} for e, hu in row["hu"].items()
+        }
         row["cost_dice"] = {t: v - base["dice"][t] for t, v in row["dice"].items()}
     return {"views": s.calibration_views, "energies_kev": list(SHOWN_KEV), "cases": rows}
 
 
 def _read(scan: SpectralScan, tissues: Tissues, images: Tensor) -> dict[str, Any]:
     """HU of the tissues and of the contrast by energy, and Dice coefficients of the tissue map."""
-    lumen = torch.from_numpy(scan.scene.volume_fractions(scan.grid)[scan.scene.index(BODIES["blood_iodine"])] > _PURE)
+    lumen = torch.from_numpy(
+        scan.scene.volume_fractions(scan.grid)[scan.scene.index(BODIES["blood_iodine"])] > _PURE
+    )
     hu = {}
     for energy in SHOWN_KEV:
         volume = vmi(images, scan.basis, [energy])[0].double()
         core, fibrous = (float(roi(volume)) for roi in scan.rois.on(scan.grid))
         hu[f"{energy:g}"] = {
-            "blood": float(volume[lumen].mean()), "core": core, "fibrous": fibrous,
-            "fat": float(volume[scan.fat].mean()), "contrast": fibrous - core,
-        }  # fmt: skip
+            "blood": float(volume[lumen].mean()),
+            "core": core,
+            "fibrous": fibrous,
+            "fat": float(volume[scan.fat].mean()),
+            "contrast": fibrous - core,
+        }
     return {"hu": hu, "dice": dict(zip(MMD_TISSUES, tissues.dice(images), strict=True))}

@@ -1,15 +1,17 @@
-"""The plaque in energy bins: basis materials, monochromatic images, tissue maps, by FBP and joint MBIR.
+"""The plaque in energy bins: basis materials, monochromatic images, tissue maps, by FBP and joint
+MBIR.
 
-The paper's plaque is scanned in eight energy bins and every ray decomposed into line integrals of the two basis
-materials, PE and PVC. Their FBP, and their joint model-based reconstruction, give basis images, those virtual
-monochromatic images (VMI) and tissue maps.
+The paper's plaque is scanned in eight energy bins and every ray decomposed into line integrals of
+the two basis materials, PE and PVC. Their FBP, and their joint model-based reconstruction, give
+basis images, those virtual monochromatic images (VMI) and tissue maps.
 
-* Noise of VMIs is exact: FBP is linear, the rays' covariance is known (Cramér–Rao, which the decomposition reaches: the
-  study checks it on its own rays), so one adjoint pass per functional replaces realisations.
-* The paper's noise levels are shares of the *standard noise*: the difference of a noisy to the noise-free scan is
-  multiplied by 0.25, 0.5 and 1.
-* What a wrong calibration costs is found by decomposing noise-free scans with a model that is not theirs, see
-  :mod:`recon.study.spectral.calibration`.
+* Noise of VMIs is exact: FBP is linear, the rays' covariance is known (Cramér–Rao, which the
+  decomposition reaches: the study checks it on its own rays), so one adjoint pass per functional
+  replaces realisations.
+* The paper's noise levels are shares of the *standard noise*: the difference of a noisy to the
+  noise-free scan is multiplied by 0.25, 0.5 and 1.
+* What a wrong calibration costs is found by decomposing noise-free scans with a model that is not
+  theirs, see :mod:`recon.study.spectral.calibration`.
 """
 
 from __future__ import annotations
@@ -50,33 +52,40 @@ from torchpcct.viz import WINDOW_HU
 __all__ = ["Images", "Settings", "checks", "figures", "measure"]
 
 VISIBLE_DICE = 0.5
-"""The core counts as visible in a tissue map if its Dice coefficient reaches this. The paper judges by eye."""
+"""The core counts as visible in a tissue map if its Dice coefficient reaches this. The paper
+judges by eye."""
 
 LOW_EXPOSURE_S = 0.35
 """The paper's shortest exposure: the decomposition must hold there, too."""
 _LOW_EXPOSURE_STEP = 8  # views between those that are looked at there
 
-_COLOURS = ("#2ca02c", "#d62728", "#1f77b4", "#202020")  # the paper's: blood green, core red, fibrous blue, fat dark
+# the paper's: blood green, core red, fibrous blue, fat dark
+_COLOURS = ("#2ca02c", "#d62728", "#1f77b4", "#202020")
 _PICTURED_KEV = (40.0, 52.0, 70.0)
 
 
 @dataclass(frozen=True)
 class Settings(StudySettings):
-    """Settings of the study; the quick ones take an eighth of the views, one realisation, no wrong calibrations.
+    """Settings of the study; the quick ones take an eighth of the views, one realisation, no wrong
+    calibrations.
 
     Args:
-        exposure_s: of the standard noise (the paper does not state it; 2.0 s is the exposure of its tables).
+        exposure_s: of the standard noise (the paper does not state it; 2.0 s is the exposure of its
+            tables).
         realizations: of the noise, for tissue maps by FBP.
-        mbir_realizations: of these, how many are reconstructed by joint MBIR at every noise level; 0: none.
+        mbir_realizations: of these, how many are reconstructed by joint MBIR at every noise level;
+            0: none.
         noise_levels: shares of the standard noise, ascending, 0 first.
         views: per rotation.
         voxel_mm: [paper: 0.2].
         kernel: of FBP (the paper names none for its spectral images).
-        calibration_views: of the noise-free scans with a wrong calibration; 0: no wrong calibrations.
+        calibration_views: of the noise-free scans with a wrong calibration; 0: no wrong
+            calibrations.
         threshold_error_kev: by which every threshold lies lower than the decomposition assumes.
         voltage_error_kv: by which the tube's voltage lies lower than the decomposition assumes.
         gain_error: relative error of the counts since the air scan, in all energy bins or in one.
-        transport_photons: followed through the silicon for a scan with all their interactions; 0: no such scan.
+        transport_photons: followed through the silicon for a scan with all their interactions; 0:
+            no such scan.
         seed: first seed of the noise.
     """
 
@@ -95,8 +104,11 @@ class Settings(StudySettings):
     seed: int = 0
 
     QUICK: ClassVar = {
-        "views": 246, "realizations": 1, "mbir_realizations": 1, "calibration_views": 0,
-    }  # fmt: skip
+        "views": 246,
+        "realizations": 1,
+        "mbir_realizations": 1,
+        "calibration_views": 0,
+    }
 
     def __post_init__(self) -> None:
         number("exposure_s", self.exposure_s, positive=True, unit="s")
@@ -111,7 +123,8 @@ class Settings(StudySettings):
                 raise ValueError(f"{name} must be 0 or at least {low}, got {getattr(self, name)}")
         if self.mbir_realizations > self.realizations:
             raise ValueError(
-                f"mbir_realizations must lie in 0…{self.realizations} (realizations), got {self.mbir_realizations}"
+                f"mbir_realizations must lie in 0…{self.realizations} (realizations), got "
+                f"{self.mbir_realizations}"
             )
         levels = self.noise_levels
         if not levels or levels[0] != 0 or any(b <= a for a, b in itertools.pairwise(levels)):
@@ -120,8 +133,8 @@ class Settings(StudySettings):
 
 @dataclass
 class Images:
-    """Basis images: ``clean`` ``(2, z, y, x)``, ``noisy`` ``(n, 2, z, y, x)`` at the standard noise, both by FBP, and
-    ``mbir``, the first of every noise level, ``(levels, 2, z, y, x)``."""
+    """Basis images: ``clean`` ``(2, z, y, x)``, ``noisy`` ``(n, 2, z, y, x)`` at the standard
+    noise, both by FBP, and ``mbir``, the first of every noise level, ``(levels, 2, z, y, x)``."""
 
     clean: Tensor
     noisy: Tensor
@@ -141,7 +154,9 @@ class Seen:
     images: Images
 
 
-def measure(settings: Settings, progress: Progress = silent, folder: str | Path | None = None) -> Measured:
+def measure(
+    settings: Settings, progress: Progress = silent, folder: str | Path | None = None
+) -> Measured:
     """Scan, decompose, reconstruct, label, in resumable pieces."""
     s, pieces, spent = settings, Pieces(folder, settings), time.process_time()
 
@@ -171,12 +186,19 @@ def measure(settings: Settings, progress: Progress = silent, folder: str | Path 
     }
     progress("tissue maps", 1.0)
     if lines:
-        data["mbir"], data["dice"]["joint MBIR"] = _mbir(scan, tissues, lines, images, data["vmi"], pieces, progress)
+        data["mbir"], data["dice"]["joint MBIR"] = _mbir(
+            scan, tissues, lines, images, data["vmi"], pieces, progress
+        )
         progress("joint MBIR", 1.0)
     if s.calibration_views:
-        costs = partial(calibration_costs, s, tissues, lambda fraction: progress("wrong calibrations", fraction))
+        costs = partial(
+            calibration_costs, s, tissues, lambda fraction: progress("wrong calibrations", fraction)
+        )
         data["calibration"] = pieces("calibration", costs)
-    residual = {name: float(np.abs(pe_pvc().residual(name)).max()) for name in ("necrotic_core", "blood_iodine")}
+    residual = {
+        name: float(np.abs(pe_pvc().residual(name)).max())
+        for name in ("necrotic_core", "blood_iodine")
+    }
     data |= {"basis_residual_hu": residual, "processor_seconds": time.process_time() - spent}
     return Measured(s, data, Seen(scan, tissues, images))
 
@@ -214,7 +236,8 @@ def _vmi(scan: SpectralScan, images: Images) -> dict[str, Any]:
     voxel.view(-1)[most] = 1.0
     functionals = torch.stack([voxel, foreground.weights, background.weights]).to(torch.float32)
     exact = functional_covariance(scan.fbp, functionals, scan.covariance(scan.settings.exposure_s))
-    # The noise of the inset is nearly stationary in the plane: all voxels of the ROI's slice, far from rounding errors.
+    # The noise of the inset is nearly stationary in the plane: all voxels of the ROI's slice, far
+    # from rounding errors.
     z = most // (scan.grid.shape[1] * scan.grid.shape[2])
     noise = (images.noisy - images.clean)[:, :, z].transpose(0, 1).reshape(2, -1).double()
     return {
@@ -230,7 +253,9 @@ def _vmi(scan: SpectralScan, images: Images) -> dict[str, Any]:
     }
 
 
-def _scores(level: float, tissues: Tissues, volumes: Sequence[Tensor] | Tensor, rule: str = "nearest") -> Any:
+def _scores(
+    level: float, tissues: Tissues, volumes: Sequence[Tensor] | Tensor, rule: str = "nearest"
+) -> Any:
     """Mean and SD of every tissue's Dice coefficient over realisations."""
     values = np.array([tissues.dice(v, rule) for v in volumes])
     spread = values.std(0, ddof=1) if len(values) > 1 else np.full(len(MMD_TISSUES), np.nan)
@@ -246,17 +271,30 @@ def _at_energy(scan: SpectralScan, images: Tensor, energy: float) -> dict[str, f
 
 
 def _mbir(
-    scan: SpectralScan, tissues: Tissues, lines: list[Tensor], images: Images, curves: dict[str, Any],
-    pieces: Pieces, progress: Progress,
-) -> tuple[dict[str, Any], list[dict[str, Any]]]:  # fmt: skip
-    """Joint MBIR at every noise level, and its scores; volumes of the first realisation go to ``images``."""
+    scan: SpectralScan,
+    tissues: Tissues,
+    lines: list[Tensor],
+    images: Images,
+    curves: dict[str, Any],
+    pieces: Pieces,
+    progress: Progress,
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Joint MBIR at every noise level, and its scores; volumes of the first realisation go to
+    ``images``."""
     s = scan.settings
     problem = BasisProblem(scan.clean, scan.model(1.0), scan.grid)
     exact, best = scan.exact.line_integrals, curves["voxel"]["optimum_kev"]
     lowest = next((v for v in s.noise_levels if v > 0), 1.0)
-    steps, scores, reports, pictures, values = 1 + (len(s.noise_levels) - 1) * len(lines), [], [], [], []
+    steps, scores, reports, pictures, values = (
+        1 + (len(s.noise_levels) - 1) * len(lines),
+        [],
+        [],
+        [],
+        [],
+    )
     for level in s.noise_levels:
-        # Data without noise take the weights of the lowest noise: it is the prior that changes them.
+        # Data without noise take the weights of the lowest noise: it is the prior that changes
+        # them.
         dose, found = s.exposure_s / (level or lowest) ** 2, []
         for k, noisy in enumerate(lines if level else lines[:1]):
             data = exact + level * (noisy - exact)
@@ -279,11 +317,12 @@ def _mbir(
     }, scores
 
 
-# --- the report -----------------------------------------------------------------------------------------------------
+# --- the report -----------------------------------------------------------------------------------
 
 
 def checks(data: dict[str, Any]) -> list[Check]:
-    """The decomposition at its bound, the best energy, and what noise leaves of the core, beside the paper's."""
+    """The decomposition at its bound, the best energy, and what noise leaves of the core, beside
+    the paper's."""
     rays, curves, fbp = data["rays"], data["vmi"], data["dice"]["FBP"]
     best, tolerance = paper.SPECTRAL["optimum_kev"], paper.SPECTRAL["optimum_tolerance_kev"]
 
@@ -295,18 +334,52 @@ def checks(data: dict[str, Any]) -> list[Check]:
     limit, lost = paper.SPECTRAL["core_visible_up_to"], paper.SPECTRAL["core_lost_at"]
     bound = "decomposition: variance over the Cramér–Rao bound"
     return [
-        Check(f"{bound}, {rays[0]['exposure_s']:g} s", rays[0]["whitened_ratio"], "not given", high=1.05),
-        Check(f"{bound}, {rays[-1]['exposure_s']:g} s", rays[-1]["whitened_ratio"], "not given", high=1.08),
-        Check("decomposition: rays without a finite, converged answer", sum(r["failed"] for r in rays), "not given",
-              high=0.0),
-        around("best energy, noise of a voxel, keV", curves["voxel"]["optimum_kev"], best, tolerance),
-        around("best energy, noise of the ROI means, keV", curves["roi_means"]["optimum_kev"], best, tolerance),
-        Check(f"core's Dice at {100 * limit:.0f} % noise (visible ≥ {VISIBLE_DICE})", core(limit), "visible",
-              low=VISIBLE_DICE),
-        Check(f"core's Dice at {100 * lost:.0f} % noise (lost < {VISIBLE_DICE})", core(lost), "lost",
-              high=VISIBLE_DICE),
-        Check("largest rise of a tissue's Dice from one noise level to the next", rise, "monotone", high=0.0),
-    ]  # fmt: skip
+        Check(
+            f"{bound}, {rays[0]['exposure_s']:g} s",
+            rays[0]["whitened_ratio"],
+            "not given",
+            high=1.05,
+        ),
+        Check(
+            f"{bound}, {rays[-1]['exposure_s']:g} s",
+            rays[-1]["whitened_ratio"],
+            "not given",
+            high=1.08,
+        ),
+        Check(
+            "decomposition: rays without a finite, converged answer",
+            sum(r["failed"] for r in rays),
+            "not given",
+            high=0.0,
+        ),
+        around(
+            "best energy, noise of a voxel, keV", curves["voxel"]["optimum_kev"], best, tolerance
+        ),
+        around(
+            "best energy, noise of the ROI means, keV",
+            curves["roi_means"]["optimum_kev"],
+            best,
+            tolerance,
+        ),
+        Check(
+            f"core's Dice at {100 * limit:.0f} % noise (visible ≥ {VISIBLE_DICE})",
+            core(limit),
+            "visible",
+            low=VISIBLE_DICE,
+        ),
+        Check(
+            f"core's Dice at {100 * lost:.0f} % noise (lost < {VISIBLE_DICE})",
+            core(lost),
+            "lost",
+            high=VISIBLE_DICE,
+        ),
+        Check(
+            "largest rise of a tissue's Dice from one noise level to the next",
+            rise,
+            "monotone",
+            high=0.0,
+        ),
+    ]
 
 
 def figures(measured: Measured) -> dict[str, Any]:
@@ -319,11 +392,14 @@ def _show(ax: Any, image: Any, measured: Measured, title: str, **options: Any) -
     ax.set_yticks([])
     ax.set_title(title, fontsize=8)
     edges = extent(measured.seen.scan.grid)
-    return ax.imshow(np.asarray(image), origin="lower", extent=edges, interpolation="nearest", **options)
+    return ax.imshow(
+        np.asarray(image), origin="lower", extent=edges, interpolation="nearest", **options
+    )
 
 
 def _curves_figure(measured: Measured) -> Any:
-    """Basis images, monochromatic images (noise free above, standard noise below), and CNR against energy."""
+    """Basis images, monochromatic images (noise free above, standard noise below), and CNR
+    against energy."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.0, 7.2), dpi=130, layout="constrained")
@@ -333,7 +409,9 @@ def _curves_figure(measured: Measured) -> Any:
     scan, images = measured.seen.scan, measured.seen.images
     z = scan.grid.shape[0] // 2
     low, high = WINDOW_HU[0] - WINDOW_HU[1] / 2, WINDOW_HU[0] + WINDOW_HU[1] / 2
-    for row, (name, volume) in enumerate((("noise free", images.clean), ("standard noise", images.noisy[0]))):
+    for row, (name, volume) in enumerate(
+        (("noise free", images.clean), ("standard noise", images.noisy[0]))
+    ):
         middle = volume[:, z]
         for c, material in enumerate(("PE", "PVC")):
             clean = images.clean[c, z]
@@ -341,24 +419,49 @@ def _curves_figure(measured: Measured) -> Any:
             if row:
                 spread = 2 * float(middle[c].std())
                 reach = (reach[0] - spread, reach[1] + spread)
-            _show(axes[row, c], middle[c], measured, f"{material}, {name}", cmap="gray", vmin=reach[0], vmax=reach[1])
+            _show(
+                axes[row, c],
+                middle[c],
+                measured,
+                f"{material}, {name}",
+                cmap="gray",
+                vmin=reach[0],
+                vmax=reach[1],
+            )
         for c, energy in enumerate(_PICTURED_KEV):
             hu = vmi(middle, scan.basis, [energy])[0]
-            shown = _show(axes[row, 2 + c], hu, measured, f"{energy:g} keV, {name}", cmap="gray", vmin=low, vmax=high)
+            shown = _show(
+                axes[row, 2 + c],
+                hu,
+                measured,
+                f"{energy:g} keV, {name}",
+                cmap="gray",
+                vmin=low,
+                vmax=high,
+            )
     top.colorbar(shown, ax=axes[:, -1], shrink=0.7, label="HU")
     left, right = bottom.subplots(1, 2)
     v = measured.data["vmi"]
     energies = v["energies_kev"]
     left.plot(energies, v["voxel"]["noise_hu"], color="tab:red", label="noise of a voxel")
-    left.plot(energies, v["voxel"]["contrast_hu"], color="tab:blue", label="contrast fibrous − core")
+    left.plot(
+        energies, v["voxel"]["contrast_hu"], color="tab:blue", label="contrast fibrous − core"
+    )
     left.set_yscale("log")
     left.set_ylabel("HU")
-    for key, style, label in (("voxel", "-", "voxel noise"), ("roi_means", "--", "ROI means (paper's protocol)")):
+    for key, style, label in (
+        ("voxel", "-", "voxel noise"),
+        ("roi_means", "--", "ROI means (paper's protocol)"),
+    ):
         cnr = np.array(v[key]["cnr"])
         best = v[key]["optimum_kev"]
-        right.plot(energies, cnr / cnr.max(), style, color="black", label=f"{label}: best {best:.1f} keV")
+        right.plot(
+            energies, cnr / cnr.max(), style, color="black", label=f"{label}: best {best:.1f} keV"
+        )
         right.axvline(best, color="black", linestyle=style, linewidth=0.8)
-    right.axvline(paper.SPECTRAL["optimum_kev"], color="tab:orange", linewidth=1.2, label="paper: 52 keV")
+    right.axvline(
+        paper.SPECTRAL["optimum_kev"], color="tab:orange", linewidth=1.2, label="paper: 52 keV"
+    )
     right.set_ylabel("CNR / best CNR")
     for ax in (left, right):
         ax.set_xlabel("energy of the monochromatic image, keV")
@@ -368,7 +471,8 @@ def _curves_figure(measured: Measured) -> Any:
 
 
 def _tissue_figure(measured: Measured) -> Any:
-    """Tissue maps of the middle slice: truth, then one column per noise level; rows: FBP, joint MBIR."""
+    """Tissue maps of the middle slice: truth, then one column per noise level; rows: FBP, joint
+    MBIR."""
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
@@ -376,22 +480,40 @@ def _tissue_figure(measured: Measured) -> Any:
     levels, dice = measured.settings.noise_levels, measured.data["dice"]
     tissues, images = measured.seen.tissues, measured.seen.images
     methods = [m for m in ("FBP", "joint MBIR") if m in dice]
-    figure = Figure(figsize=(1.9 * (1 + len(levels)) + 0.4, 2.25 * len(methods) + 0.7), dpi=150, layout="constrained")
+    figure = Figure(
+        figsize=(1.9 * (1 + len(levels)) + 0.4, 2.25 * len(methods) + 0.7),
+        dpi=150,
+        layout="constrained",
+    )
     axes = figure.subplots(len(methods), 1 + len(levels), squeeze=False)
     colours = ListedColormap(["white", *_COLOURS])
     k = tissues.middle
     for row, method in enumerate(methods):
-        _show(axes[row, 0], tissues.truth[k] + 1, measured, "truth" if row == 0 else "", cmap=colours, vmin=0, vmax=4)
+        _show(
+            axes[row, 0],
+            tissues.truth[k] + 1,
+            measured,
+            "truth" if row == 0 else "",
+            cmap=colours,
+            vmin=0,
+            vmax=4,
+        )
         axes[row, 0].set_ylabel(method, fontsize=9)
         for c, level in enumerate(levels):
-            volume = images.fbp(level)[0] if images.mbir is None or method == "FBP" else images.mbir[c]
+            volume = (
+                images.fbp(level)[0] if images.mbir is None or method == "FBP" else images.mbir[c]
+            )
             labels = tissues.labels(volume)[k]
             ax = axes[row, 1 + c]
-            _show(ax, labels + 1, measured, f"{100 * level:.0f} % noise", cmap=colours, vmin=0, vmax=4)
+            _show(
+                ax, labels + 1, measured, f"{100 * level:.0f} % noise", cmap=colours, vmin=0, vmax=4
+            )
             score = dice[method][c]["necrotic_core"]["mean"]
             ax.set_xlabel(f"core's Dice {score:.2f}", fontsize=7)
     names = [t.replace("_", " ") for t in MMD_TISSUES]
     handles = [Patch(color=c, label=n) for c, n in zip(_COLOURS, names, strict=True)]
-    handles.append(Patch(facecolor="white", edgecolor="black", label="vessel wall, mixed voxels (left out)"))
+    handles.append(
+        Patch(facecolor="white", edgecolor="black", label="vessel wall, mixed voxels (left out)")
+    )
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=7)
     return figure

@@ -1,4 +1,5 @@
-"""The plaque scanned in energy bins and decomposed ray by ray, and tissue maps of its basis images."""
+"""The plaque scanned in energy bins and decomposed ray by ray, and tissue maps of its basis
+images."""
 
 from __future__ import annotations
 
@@ -44,30 +45,42 @@ FAT_MM = 3.2
 """From the vessel's axis on there is only fat."""
 
 NOISE_COLUMNS = 32
-"""Columns kept on either side of the inset's footprint: the ramp filter's tail falls as 1 / n², its square as 1 / n⁴,
-so the noise beyond adds less than 1e-4 to the variance of an ROI mean."""
+"""Columns kept on either side of the inset's footprint: the ramp filter's tail falls as 1 / n², its
+square as 1 / n⁴, so the noise beyond adds less than 1e-4 to the variance of an ROI mean."""
 
-BODIES = {"blood_iodine": "lumen", "necrotic_core": "core", "fibrous_tissue": "fibrous", "pericoronary_fat": "patient"}
-"""Tissue of the decomposition → body of the scene. The vessel's wall (0.19 mm) is a fifth material, not among them."""
+BODIES = {
+    "blood_iodine": "lumen",
+    "necrotic_core": "core",
+    "fibrous_tissue": "fibrous",
+    "pericoronary_fat": "patient",
+}
+"""Tissue of the decomposition → body of the scene. The vessel's wall (0.19 mm) is a fifth
+material, not among them."""
 
-RULES = {"nearest": "FBP", "k-means": "FBP, k-means of fractions", "largest": "FBP, largest fraction"}
-"""How a tissue is read from the fractions → name in reports. The paper names "a standard 2D k-means" and not its
-features. ``nearest``: the tissue nearest to the mixture, in standard deviations (k-means with centres held at the
-tissues); ``k-means``: of the fractions, slice by slice, started at the tissues; ``largest``: the largest fraction."""
+RULES = {
+    "nearest": "FBP",
+    "k-means": "FBP, k-means of fractions",
+    "largest": "FBP, largest fraction",
+}
+"""How a tissue is read from the fractions → name in reports. The paper names "a standard 2D
+k-means" and not its features. ``nearest``: the tissue nearest to the mixture, in standard
+deviations (k-means with centres held at the tissues); ``k-means``: of the fractions, slice by
+slice, started at the tissues; ``largest``: the largest fraction."""
 
 PURE = 0.5
 """A voxel counts as a tissue if that fills more than this share of it."""
 
 
 class SpectralScan:
-    """The plaque in energy bins: expected counts, their decomposition, and noisy realisations of it.
+    """The plaque in energy bins: expected counts, their decomposition, and noisy realisations of
+    it.
 
     Args:
         settings: of the study.
         progress: called with the finished fraction of the simulation.
         detector: another one than the preset's.
-        full_views: of the complete scan that ``settings.views`` stand for, each with its turn of the gantry; None: the
-            scan has no more.
+        full_views: of the complete scan that ``settings.views`` stand for, each with its turn of
+            the gantry; None: the scan has no more.
         pieces: keep the noise-free scan and its decomposition.
 
     Attributes:
@@ -78,10 +91,13 @@ class SpectralScan:
     """
 
     def __init__(
-        self, settings: Any, progress: Callable[[float], None] | None = None,
-        detector: SiliconDetector | None = None, full_views: int | None = None,
+        self,
+        settings: Any,
+        progress: Callable[[float], None] | None = None,
+        detector: SiliconDetector | None = None,
+        full_views: int | None = None,
         pieces: Pieces | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.settings, self._pieces = settings, pieces or Pieces(None, None)
         self.scene, self.plaque = plaque_scene()
         self.scanner = presets.pcct(views=settings.views, mode="spectral", detector=detector)
@@ -104,8 +120,10 @@ class SpectralScan:
 
     @cached_property
     def exact(self) -> Decomposition:
-        """Decomposition of the expected counts: true line integrals; information of :data:`NOISE_FREE_EXPOSURE_S`."""
-        # Newton's method squares the error in every step: after one of 1e-3 standard deviations 1e-6 are left.
+        """Decomposition of the expected counts: true line integrals; information of
+        :data:`NOISE_FREE_EXPOSURE_S`."""
+        # Newton's method squares the error in every step: after one of 1e-3 standard deviations
+        # 1e-6 are left.
         run = partial(decompose_scan, self.clean, self.model(NOISE_FREE_EXPOSURE_S), tolerance=1e-3)
         return self._pieces("exact", run)
 
@@ -135,12 +153,15 @@ class SpectralScan:
         """A noisy scan, only every ``step``-th view of it, decomposed.
 
         Returns:
-            Line integrals ``(2, views, rows, columns)`` in mm, and how they scatter about the true ones:
-            ``variance_ratio``: mean squared error of each component over its Cramér–Rao bound; ``whitened_ratio``:
-            half of the mean squared error in the metric of the Fisher information, 1 at the bound; ``bias``: mean error
-            of each component in its standard deviations; ``zero_bins``: share of the readings that counted nothing;
-            ``rays``, ``at_bound``, ``failed``: numbers of rays; ``rays_per_second``: by the clock, on ``threads``
-            threads; ``rays_per_core_second``: of processor time, whatever else the machine does.
+            Line integrals ``(2, views, rows, columns)`` in mm, and how they scatter about the true
+            ones:
+            ``variance_ratio``: mean squared error of each component over its Cramér–Rao bound;
+                ``whitened_ratio``:
+            half of the mean squared error in the metric of the Fisher information, 1 at the bound;
+            ``bias``: mean error of each component in its standard deviations; ``zero_bins``: share
+            of the readings that counted nothing; ``rays``, ``at_bound``, ``failed``: numbers of
+            rays; ``rays_per_second``: by the clock, on ``threads`` threads;
+            ``rays_per_core_second``: of processor time, whatever else the machine does.
         """
         clean, views = self.clean, slice(None, None, step)
         if step > 1:
@@ -151,7 +172,9 @@ class SpectralScan:
         seconds, spent = time.perf_counter() - start, time.process_time() - spent
         truth, c = self.exact.line_integrals[:, views], self.covariance(exposure_s)[:, views]
         error = found.line_integrals - truth
-        whitened = c[2] * error[0].square() - 2 * c[1] * error[0] * error[1] + c[0] * error[1].square()
+        whitened = (
+            c[2] * error[0].square() - 2 * c[1] * error[0] * error[1] + c[0] * error[1].square()
+        )
         whitened /= 2 * (c[0] * c[2] - c[1].square())
         rays = error[0].numel()
         return found.line_integrals, {
@@ -162,7 +185,8 @@ class SpectralScan:
             "bias": [_mean(v) for v in error / c[[0, 2]].sqrt()],
             "zero_bins": scan.zero_fraction,
             "at_bound": int(found.at_bound.sum()),
-            "failed": int((~found.converged).sum()) + int((~torch.isfinite(found.line_integrals)).sum()),
+            "failed": int((~found.converged).sum())
+            + int((~torch.isfinite(found.line_integrals)).sum()),
             "rays_per_second": rays / seconds,
             "rays_per_core_second": rays / spent,
             "threads": get_num_threads(),
@@ -174,7 +198,8 @@ def _mean(values: Tensor) -> float:
 
 
 def truth_labels(scene: Scene, grid: VolumeGrid) -> Tensor:
-    """Index into :data:`~torchpcct.spectral.MMD_TISSUES` of the tissue that fills most of each voxel, ``grid.shape``.
+    """Index into :data:`~torchpcct.spectral.MMD_TISSUES` of the tissue that fills most of each
+    voxel, ``grid.shape``.
 
     −1: no tissue fills half of it, or it is vessel wall, which the decomposition does not know.
     """
@@ -206,7 +231,8 @@ class Tissues:
         self.truth = truth_labels(scan.scene, scan.grid)[self.slices]
         self.middle = int(np.abs(z[self.slices] - scan.plaque.position[2]).argmin())
         model = scan.model(1.0)
-        # As the detector sees the tissues behind the patient: iodine's K edge makes blood depend on the spectrum.
+        # As the detector sees the tissues behind the patient: iodine's K edge makes blood depend on
+        # the spectrum.
         centre = model.columns // 2
         path = scan.surround[:, scan.surround.shape[1] // 2, centre].double().numpy()
         detected = model.spectra[centre].sum(0) * np.exp(-path @ model.attenuation)
@@ -214,8 +240,8 @@ class Tissues:
         self.corners = np.stack(corners, axis=1)
 
     def labels(self, images: Tensor, rule: str = "nearest") -> Tensor:
-        """Tissue of every voxel of the slices, ``(slices, y, x)``, from basis images ``(2, z, y, x)`` by one of
-        :data:`RULES`."""
+        """Tissue of every voxel of the slices, ``(slices, y, x)``, from basis images ``(2, z, y,
+        x)`` by one of :data:`RULES`."""
         choice("rule", rule, RULES)
         fractions = mmd(images[:, self.slices], self.basis, self.corners, self.covariance)
         if rule == "nearest":
@@ -225,7 +251,8 @@ class Tissues:
         return label(fractions)
 
     def dice(self, images: Tensor, rule: str = "nearest") -> list[float]:
-        """Dice coefficient of every tissue over the slices through the core; voxels without a true tissue left out."""
+        """Dice coefficient of every tissue over the slices through the core; voxels without a
+        true tissue left out."""
         known = self.truth >= 0
         found, truth = self.labels(images, rule)[known], self.truth[known]
         return [dice(found == k, truth == k) for k in range(len(MMD_TISSUES))]

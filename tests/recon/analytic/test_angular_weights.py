@@ -18,7 +18,8 @@ HALF_FAN = math.atan(40 * 8.0 / 1040.0)
 
 
 def line_of_ray(beta: float, gamma: float) -> tuple[float, float]:
-    """Direction (mod π) and signed distance of a ray, from the conventions of the geometry alone."""
+    """Direction (mod π) and signed distance of a ray, from the conventions of the geometry
+    alone."""
     source = np.array([math.cos(beta), math.sin(beta)])
     across = np.array([-math.sin(beta), math.cos(beta)])
     d = -source * math.cos(gamma) + across * math.sin(gamma)
@@ -41,7 +42,8 @@ def test_pairs_of_opposite_rays_share_one(half_fan, extra, where, ray):
     beta = where * span
     opposite = beta + math.pi - 2 * gamma
     a, b = line_of_ray(beta, gamma), line_of_ray(opposite, -gamma)
-    assert math.isclose(math.cos(a[0] - b[0]), -1, abs_tol=1e-12)  # the same line, the other way round
+    # the same line, the other way round
+    assert math.isclose(math.cos(a[0] - b[0]), -1, abs_tol=1e-12)
     assert math.isclose(a[1], -b[1], abs_tol=1e-12)
     shares = [
         float(parker_share(np.array(x), np.array(g), virtual))
@@ -69,7 +71,8 @@ def test_parker_is_smooth_and_not_all_ones():
 @pytest.mark.parametrize("detector", ["flat", "curved"])
 @pytest.mark.parametrize("degrees", [0.0, 8.0, 60.0, 130.0])
 def test_weights_of_a_scan_cover_every_line_once(degrees, detector):
-    """Σ over all readings of a line's neighbourhood: the integral of w over β at fixed lines is ∫dθ = π."""
+    """Σ over all readings of a line's neighbourhood: the integral of w over β at fixed lines is
+    ∫dθ = π."""
     half_fan = HALF_FAN if detector == "flat" else 40 * 8.0 / 1040.0
     span = math.pi + 2 * half_fan + math.radians(degrees)
     n = 720
@@ -139,7 +142,8 @@ def test_parallel_scans_repeat_after_half_a_turn():
 @pytest.mark.parametrize(("turn", "views"), [(360.0, 457), (360.0, 361), (180.0, 181)])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_both_ends_of_a_turn_share_one_step(turn, views, dtype, caplog):
-    """Angles of a file, in single precision: no gap "where the usual step is 0.00°", and said as what it is."""
+    """Angles of a file, in single precision: no gap "where the usual step is 0.00°", and said as
+    what it is."""
     geometry = ParallelBeam(np.deg2rad(np.linspace(0.0, turn, views)).astype(dtype), 9, 1.0)
     weights = angular_weights(geometry)[:, 0]
     assert weights.sum() == pytest.approx(math.pi)
@@ -157,7 +161,8 @@ def test_too_few_views_are_refused():
     with pytest.raises(ValueError, match=r"cover 120\.0°, but parallel rays need 180°"):
         angular_weights(ParallelBeam(np.arange(120) * math.pi / 180, 9, 1.0))
     with pytest.raises(
-        ValueError, match=r"cover 200\.0°, but this fan needs 180° \+ 34\.\d°.*or reconstruct by \"pwls\""
+        ValueError,
+        match=r"cover 200\.0°, but this fan needs 180° \+ 34\.\d°.*or reconstruct by \"pwls\"",
     ):
         angular_weights(FanBeam(np.arange(200) * math.pi / 180, **FAN))
 
@@ -166,7 +171,8 @@ def test_too_few_views_are_refused():
 @pytest.mark.parametrize("step", [0.5, 2.0, 5.0, 9.0])
 @pytest.mark.parametrize("lacking", [0.0, 3.0, 7.0])
 def test_a_short_scan_that_lacks_some_of_its_fan(kind, step, lacking):
-    """What may lack does not grow with the step: at 5° a whole fan of 7° once passed without a word."""
+    """What may lack does not grow with the step: at 5° a whole fan of 7° once passed without a
+    word."""
     cells = (100,) if kind is FanBeam else (100, 2)
     half_fan = math.degrees(math.atan(50 * 0.5 / 400.0)) - math.degrees(0.25 / 400.0)
     needed = 180.0 + 2.0 * half_fan

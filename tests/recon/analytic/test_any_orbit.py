@@ -1,4 +1,5 @@
-"""FBP of detectors that tilt, roll, jitter and mirror: exact lines along the vectors, compared with exact bodies."""
+"""FBP of detectors that tilt, roll, jitter and mirror: exact lines along the vectors, compared
+with exact bodies."""
 
 import math
 from dataclasses import replace
@@ -39,7 +40,8 @@ def rotated(x, axis, angle):
 
 
 def wobbling(seed=0):
-    """A cone beam whose detector jitters by cells, rolls and tilts by degrees, and whose source leaves the circle."""
+    """A cone beam whose detector jitters by cells, rolls and tilts by degrees, and whose source
+    leaves the circle."""
     rng, v = np.random.default_rng(seed), VectorGeometry.of(CONE).vectors.reshape(-1, 4, 3).copy()
     n = len(v)
     normal = v[:, 0] / np.linalg.norm(v[:, 0], axis=1, keepdims=True)
@@ -53,7 +55,8 @@ def wobbling(seed=0):
 
 @pytest.mark.extended
 def test_wobbling_cone_beam():
-    """3° of roll, 4° of tilt, four columns aside, a cell of jitter: 2 % of the truth; ignored, more than 10 %."""
+    """3° of roll, 4° of tilt, four columns aside, a cell of jitter: 2 % of the truth; ignored,
+    more than 10 %."""
     v, grid = wobbling(), VolumeGrid((2, 48, 48), (1.0, 2.0, 2.0))
     data = lines(v, CONE.columns, CONE.rows)
     geometry = VectorGeometry(v, CONE.columns, CONE.rows)
@@ -74,20 +77,27 @@ def test_an_ideal_circle_stays_itself():
 
 @pytest.mark.parametrize("aside", [0.25, 0.4, 0.7])
 def test_slopes_stay_in_their_place_between_cells(aside):
-    """A parabola along the columns, a slope along the rows, and detectors that stand aside by turns. Torch's cubic
-    interpolation moved slopes there and back by a twentieth of a cell: sound scans had steps of 1 % too few."""
-    moved = VectorGeometry.of(CONE).shifted(columns=np.resize([aside, -aside], CONE.views), rows=0.3)
+    """A parabola along the columns, a slope along the rows, and detectors that stand aside by
+    turns. Torch's cubic interpolation moved slopes there and back by a twentieth of a cell: sound
+    scans had steps of 1 % too few."""
+    moved = VectorGeometry.of(CONE).shifted(
+        columns=np.resize([aside, -aside], CONE.views), rows=0.3
+    )
     u, v = np.arange(CONE.columns), np.arange(CONE.rows)[:, None]
     data = torch.from_numpy(np.broadcast_to(0.01 * (u - 20.0) ** 2 + 0.3 * v, moved.shape).copy())
     rebinned, circle = rebin_to_circle(data, moved)
     h, w = circle.rows.size, circle.geometry.columns
-    place = np.stack([np.tile(circle.geometry.column_positions, h), np.repeat(circle.rows, w), np.ones(h * w)])
+    place = np.stack(
+        [np.tile(circle.geometry.column_positions, h), np.repeat(circle.rows, w), np.ones(h * w)]
+    )
     at = circle.maps @ place
     at = at[:, :2] / at[:, 2:] + np.array([[(CONE.columns - 1) / 2], [(CONE.rows - 1) / 2]])
     inside = ((at >= 1.0) & (at <= np.array([[CONE.columns], [CONE.rows]]) - 2.0)).all(1)
     expected = 0.01 * (at[:, 0] - 20.0) ** 2 + 0.3 * at[:, 1]
     assert inside.mean() > 0.5
-    np.testing.assert_allclose(rebinned.numpy().reshape(len(at), -1)[inside], expected[inside], atol=1e-9)
+    np.testing.assert_allclose(
+        rebinned.numpy().reshape(len(at), -1)[inside], expected[inside], atol=1e-9
+    )
 
 
 def test_mirrored_axes_and_other_pitches_of_a_fan():
@@ -95,7 +105,10 @@ def test_mirrored_axes_and_other_pitches_of_a_fan():
     v[:, 4:] *= -1.0  # columns counted the other way
     v[::2, 4:] *= 0.98  # two detectors
     v[:, 2:4] += np.random.default_rng(1).uniform(-1, 1, (len(v), 2))
-    assert worst(fbp(lines(v, FAN.columns), VectorGeometry(v, FAN.columns), GRID, outside=0.0), GRID) < 0.015
+    assert (
+        worst(fbp(lines(v, FAN.columns), VectorGeometry(v, FAN.columns), GRID, outside=0.0), GRID)
+        < 0.015
+    )
 
 
 def test_parallel_vectors_with_roll_and_jitter():
@@ -105,7 +118,9 @@ def test_parallel_vectors_with_roll_and_jitter():
     zero = np.zeros((n, 1))
     u = np.concatenate([flat[:, 4:] * math.cos(roll), zero + math.sin(roll)], 1)
     up = np.concatenate([-flat[:, 4:] * math.sin(roll), zero + math.cos(roll)], 1)
-    centre = np.concatenate([flat[:, 2:4] + rng.uniform(-2, 2, (n, 1)) * flat[:, 4:], rng.uniform(-1, 1, (n, 1))], 1)
+    centre = np.concatenate(
+        [flat[:, 2:4] + rng.uniform(-2, 2, (n, 1)) * flat[:, 4:], rng.uniform(-1, 1, (n, 1))], 1
+    )
     v = np.concatenate([flat[:, :2], zero, centre, u, up], 1)
     grid = VolumeGrid((3, 48, 48), (1.0, 2.0, 2.0))
     image = fbp(lines(v, 100, 9, parallel=True), VectorGeometry(v, 100, 9, True), grid, outside=0.0)
@@ -121,7 +136,9 @@ def test_what_fbp_cannot_do_is_refused():
     data = torch.zeros(CONE.shape)
     helix = v.copy()
     helix[:, [2, 5]] += np.linspace(-10, 10, len(v))[:, None]
-    with pytest.raises(ValueError, match=r"climbs by 20\.00 mm.*of a helix is not provided.*recon\.pwls"):
+    with pytest.raises(
+        ValueError, match=r"climbs by 20\.00 mm.*of a helix is not provided.*recon\.pwls"
+    ):
         rebin_to_circle(data, VectorGeometry(helix, CONE.columns, CONE.rows))
     with pytest.raises(ValueError, match=r"table travels by 20\.00 mm.*recon\.pwls"):
         fbp(data, CONE, VolumeGrid((2, 8, 8), 2.0), motion=helical_motion(CONE, 20.0 * 180 / 179))
@@ -132,6 +149,7 @@ def test_what_fbp_cannot_do_is_refused():
     tilted[:, 2] = 20.0
     with pytest.raises(ValueError, match=r"leave the plane of rotation by up to 2\.86°"):
         rebin_to_circle(data, VectorGeometry(tilted, CONE.columns, CONE.rows, parallel=True))
-    edge_on = VectorGeometry.of(replace(CONE, pitch=(1.6, 15.0))).turned(slant=1.45)  # 0.8 m to either side
+    # 0.8 m to either side
+    edge_on = VectorGeometry.of(replace(CONE, pitch=(1.6, 15.0))).turned(slant=1.45)
     with pytest.raises(ValueError, match="a detector reaches behind its source"):
         rebin_to_circle(data, edge_on)

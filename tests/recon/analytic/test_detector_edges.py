@@ -1,4 +1,5 @@
-"""Detectors as they are: half fans, rows that end inside the object, dead cells. Compared with exact bodies."""
+"""Detectors as they are: half fans, rows that end inside the object, dead cells. Compared with
+exact bodies."""
 
 import math
 from dataclasses import replace
@@ -29,10 +30,13 @@ FULL = {
 
 
 def truth_and_inside(grid, margin=6.0, radius=math.inf):
-    """Values at the voxels, and those that lie ``margin`` mm inside the body and within ``radius`` of the axis."""
+    """Values at the voxels, and those that lie ``margin`` mm inside the body and within
+    ``radius`` of the axis."""
     y, x = grid.axes[-2][:, None], grid.axes[-1]
     value = sum(b.at(np.zeros(1), y, x) for b in BODY)
-    shrunk = Ellipsoid((4.0, -6.0), (70.0 - margin, 85.0 - margin), value=1.0).at(np.zeros(1), y, x) > 0
+    shrunk = (
+        Ellipsoid((4.0, -6.0), (70.0 - margin, 85.0 - margin), value=1.0).at(np.zeros(1), y, x) > 0
+    )
     return value, shrunk & (np.hypot(y, x) < radius)
 
 
@@ -40,7 +44,11 @@ def cropped(geometry, before, behind):
     """The geometry without its first and last columns."""
     pitch = geometry.pitch[1] if isinstance(geometry, ConeBeam) else geometry.pitch
     shift = 0.5 * (before - behind) * pitch
-    offset = (geometry.offset[0], geometry.offset[1] + shift) if isinstance(geometry, ConeBeam) else shift
+    offset = (
+        (geometry.offset[0], geometry.offset[1] + shift)
+        if isinstance(geometry, ConeBeam)
+        else shift
+    )
     return replace(geometry, columns=geometry.columns - before - behind, offset=offset)
 
 
@@ -57,7 +65,8 @@ def worst(image, grid, radius=math.inf):
 @pytest.mark.parametrize("lost", [(90, 0), (0, 60), (12, 0)], ids=["first", "last", "few"])
 @pytest.mark.parametrize("kind", FULL)
 def test_offset_detectors_see_the_whole_object(kind, lost):
-    """Half of the cells are enough: within 1 % of the exact values everywhere, as the whole detector is."""
+    """Half of the cells are enough: within 1 % of the exact values everywhere, as the whole
+    detector is."""
     geometry = cropped(FULL[kind], *lost)
     assert is_offset(geometry)
     sinogram = scanned(geometry)
@@ -78,7 +87,9 @@ def test_shares_of_a_pair_add_up_to_one_and_vanish_at_the_short_edge():
     for u in (np.arange(100) - 20.0, np.arange(100) - 80.0):
         share = offset_share(u)
         overlap = np.abs(u) <= 19
-        np.testing.assert_allclose(share[overlap] + np.interp(-u, u, share)[overlap], 1.0, atol=1e-12)
+        np.testing.assert_allclose(
+            share[overlap] + np.interp(-u, u, share)[overlap], 1.0, atol=1e-12
+        )
         assert share[np.abs(u).argmax()] == 1.0
         short = share[0] if u[-1] > -u[0] else share[-1]
         assert 0.0 <= short < 2e-3
@@ -88,26 +99,32 @@ def test_shares_of_a_pair_add_up_to_one_and_vanish_at_the_short_edge():
 
 def test_half_a_turn_of_an_offset_detector_is_refused():
     geometry = cropped(replace(FULL["flat"], angles=np.arange(500) * math.pi / 360), 90, 0)
-    with pytest.raises(ValueError, match=r"the detector is offset .* needs a full turn, but the views cover 250"):
+    with pytest.raises(
+        ValueError, match=r"the detector is offset .* needs a full turn, but the views cover 250"
+    ):
         angular_weights(geometry)
 
 
 @pytest.mark.parametrize("lost", [(0, 14), (14, 0)])
 def test_a_short_scan_of_an_offset_detector_within_its_short_side(lost):
-    """An object that both sides see is measured whole in 240°, however far the long side reaches."""
+    """An object that both sides see is measured whole in 240°, however far the long side
+    reaches."""
     turn = np.arange(480) * math.radians(240.0) / 479
     geometry = cropped(replace(FULL["flat"], angles=turn), *lost)
     assert is_offset(geometry)
     radius = geometry.fov_radius
     grid = VolumeGrid((96, 96), 2.0 * (radius - 1.0) / 96)
     assert worst(fbp(scanned(geometry), geometry, grid), grid) < 0.015
-    with pytest.raises(ValueError, match=rf"reconstruct no more than {radius:.4g} mm about the axis"):
+    with pytest.raises(
+        ValueError, match=rf"reconstruct no more than {radius:.4g} mm about the axis"
+    ):
         fbp(scanned(geometry), geometry, VolumeGrid((96, 96), 2.1 * radius / 96))
 
 
 @pytest.mark.parametrize("kind", FULL)
 def test_rows_that_end_inside_the_object_are_continued(kind):
-    """60 % of the width: 1 % in the inner 80 % of the field of view; just ending the rows errs by more than 10 %."""
+    """60 % of the width: 1 % in the inner 80 % of the field of view; just ending the rows errs
+    by more than 10 %."""
     geometry = cropped(FULL[kind], 44, 44)
     sinogram = scanned(geometry)
     radius = 0.8 * (66.0 if kind == "parallel" else geometry.fov_radius)
@@ -118,9 +135,16 @@ def test_rows_that_end_inside_the_object_are_continued(kind):
 
 
 def test_a_cut_cylinder_is_continued_exactly():
-    for whole in (*FULL.values(), ConeBeam(full_turn(12), 600.0, 1000.0, 220, 3, (40.0, 1.7), detector="curved")):
+    for whole in (
+        *FULL.values(),
+        ConeBeam(full_turn(12), 600.0, 1000.0, 220, 3, (40.0, 1.7), detector="curved"),
+    ):
         # The rays of a fan turn: off the axis the fit is close, not exact.
-        body = [Ellipsoid((5.0, -6.0) if isinstance(whole, ParallelBeam) else (0.0, 0.0), 95.0, value=MU)]
+        body = [
+            Ellipsoid(
+                (5.0, -6.0) if isinstance(whole, ParallelBeam) else (0.0, 0.0), 95.0, value=MU
+            )
+        ]
         geometry = cropped(whole, 40, 30)
         lines = torch.from_numpy(line_integrals(geometry, body, sub=1))
         weights = np.ones((geometry.views, 1))

@@ -25,8 +25,15 @@ MU = 0.02
 pytestmark = pytest.mark.filterwarnings("ignore:the rows end inside the object")
 
 
-def project(geometry: Any, center: tuple[float, ...], radius: float, half_height: float | None = None, sub: int = 1):
-    """Exact line integrals of an ellipsoid of revolution about z at (x, y, z); of a cylinder without a height; MU."""
+def project(
+    geometry: Any,
+    center: tuple[float, ...],
+    radius: float,
+    half_height: float | None = None,
+    sub: int = 1,
+):
+    """Exact line integrals of an ellipsoid of revolution about z at (x, y, z); of a cylinder
+    without a height; MU."""
     x, y, *z = center
     body = Ellipsoid((y, x), radius, value=MU)
     if half_height is not None:
@@ -48,12 +55,15 @@ def project(geometry: Any, center: tuple[float, ...], radius: float, half_height
     y=st.floats(-0.3, 0.3),
 )
 def test_gain_is_one(beam, kernel, size, magnification, fan, columns, offset, voxel, x, y):
-    """A cylinder reads its value for every scanner size, fan, pitch, offset, voxel size, position and kernel."""
+    """A cylinder reads its value for every scanner size, fan, pitch, offset, voxel size,
+    position and kernel."""
     sod = 600.0 * size
     radius = sod * math.sin(fan)
     if beam == "parallel":
         pitch = 2.1 * radius / columns
-        geometry: Geometry = ParallelBeam(np.arange(360) * math.pi / 360, columns, pitch, offset * pitch)
+        geometry: Geometry = ParallelBeam(
+            np.arange(360) * math.pi / 360, columns, pitch, offset * pitch
+        )
     else:
         sdd = sod * magnification
         pitch = 2.1 * (sdd * fan if beam == "curved" else sdd * math.tan(fan)) / columns
@@ -72,7 +82,8 @@ def test_gain_is_one(beam, kernel, size, magnification, fan, columns, offset, vo
 
 @pytest.mark.parametrize("detector", ["flat", "curved"])
 def test_cone_gain_is_one_in_every_slice_for_every_kernel(detector):
-    """FDK is exact for bodies that do not change along z: the inset of an off-centre plaque in a cylinder."""
+    """FDK is exact for bodies that do not change along z: the inset of an off-centre plaque in a
+    cylinder."""
     geometry = ConeBeam(full_turn(360), 626, 1098, 500, 6, (3.0, 1.05), (0.4, 0.2625), detector)
     grid = VolumeGrid((5, 8, 8), (1.8, 0.2, 0.2), (0.2, -30.38, -29.63))
     sinogram = project(geometry, (0.0, 0.0), 120.0)
@@ -80,7 +91,9 @@ def test_cone_gain_is_one_in_every_slice_for_every_kernel(detector):
     assert (image.mean(dim=(-1, -2)) / MU - 1).abs().max() < 1e-3
     # the same body from far larger cone angles: every slice reads the same
     steep = ConeBeam(full_turn(360), 626, 1098, 500, 9, (60.0, 1.05), (0.0, 0.2625), detector)
-    slices = fbp(project(steep, (0.0, 0.0), 120.0), steep, VolumeGrid((5, 3, 3), (30.0, 4.0, 4.0)), KERNELS)
+    slices = fbp(
+        project(steep, (0.0, 0.0), 120.0), steep, VolumeGrid((5, 3, 3), (30.0, 4.0, 4.0)), KERNELS
+    )
     assert (slices.mean(dim=(-1, -2)) / MU - 1).abs().max() < 1e-3
     # heights beyond the outermost row's centre read that row: nothing but its obliquity changes
     high = fbp(sinogram, geometry, replace(grid, center=(6.0, *grid.center[1:])), KERNELS)
@@ -93,19 +106,29 @@ def test_position_and_orientation_of_a_sphere(detector):
     geometry = ConeBeam(full_turn(180, 0.4), 300, 500, 64, 32, (2.0, 2.1), (0.7, -0.5), detector)
     center = (11.0, -6.5, 4.0)
     grid = VolumeGrid((24, 24, 24), 1.0, (3.0, -5.0, 10.0))
-    image = fbp(project(geometry, center, 6.0, 6.0), geometry, grid, "soft").clamp_min(0.4 * MU) - 0.4 * MU
+    image = (
+        fbp(project(geometry, center, 6.0, 6.0), geometry, grid, "soft").clamp_min(0.4 * MU)
+        - 0.4 * MU
+    )
     z, y, x = (torch.from_numpy(a) for a in grid.axes)
     mass = image.sum()
-    found = [((image.sum(dim=d) @ a) / mass).item() for d, a in (((0, 1), x), ((0, 2), y), ((1, 2), z))]
+    found = [
+        ((image.sum(dim=d) @ a) / mass).item() for d, a in (((0, 1), x), ((0, 2), y), ((1, 2), z))
+    ]
     assert found == pytest.approx(center, abs=0.05)
 
 
 @pytest.mark.parametrize("detector", ["flat", "curved"])
 @pytest.mark.parametrize("extra", [0.0, 20.0, 145.0])
 def test_short_scans(detector, extra):
-    """Minimal, over- and nearly full scans reconstruct an off-centre disc as the full circle does."""
+    """Minimal, over- and nearly full scans reconstruct an off-centre disc as the full circle
+    does."""
     columns, pitch = 400, 0.9
-    half = 0.5 * columns * pitch / 1098 if detector == "curved" else math.atan(0.5 * columns * pitch / 1098)
+    half = (
+        0.5 * columns * pitch / 1098
+        if detector == "curved"
+        else math.atan(0.5 * columns * pitch / 1098)
+    )
     span = math.pi + 2 * half + math.radians(extra)
     assert span < 2 * math.pi
     grid = VolumeGrid((24, 24), 3.0, (-14.0, 5.0))
@@ -124,7 +147,9 @@ def test_irregular_repeated_and_many_turns():
     regular = full_turn(300)
     angles = {
         "jitter": regular + rng.uniform(-0.4, 0.4, 300) * 2 * math.pi / 300,
-        "dense half": np.concatenate([np.linspace(0, math.pi, 400, endpoint=False), math.pi + full_turn(200)[:100]]),
+        "dense half": np.concatenate(
+            [np.linspace(0, math.pi, 400, endpoint=False), math.pi + full_turn(200)[:100]]
+        ),
         "repeated": np.concatenate([regular, regular[:77]]),
         "400 degrees": np.arange(334) * 2 * math.pi / 300,
     }
@@ -142,9 +167,12 @@ def test_irregular_repeated_and_many_turns():
 
 @pytest.mark.parametrize("detector", ["flat", "curved"])
 def test_invariances(detector):
-    """Turning the scan turns the image; a part of the grid is the crop; far away, a fan is parallel."""
+    """Turning the scan turns the image; a part of the grid is the crop; far away, a fan is
+    parallel."""
     geometry = ConeBeam(full_turn(36), 50, 90, 41, 6, (1.5, 1.5), (0.2, 0.3), detector)
-    data = torch.randn(geometry.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    data = torch.randn(
+        geometry.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    )
     grid = VolumeGrid((3, 8, 8), 1.2)
     image = fbp(data, geometry, grid)
     turned = fbp(data, replace(geometry, angles=geometry.angles + math.pi / 2), grid)
@@ -164,7 +192,8 @@ def bead(geometry: FanBeam, at: tuple[float, float]) -> np.ndarray:
 
 @pytest.mark.parametrize("detector", ["flat", "curved"])
 def test_quarter_column_offset_raises_the_resolution_at_the_isocentre(detector):
-    """With an even number of columns and no offset the isocentre always falls between two columns."""
+    """With an even number of columns and no offset the isocentre always falls between two
+    columns."""
     plain = FanBeam(full_turn(180), 626, 1098, 60, 1.0, 0.0, detector)
     quarter = replace(plain, offset=0.25)
     a, b = bead(plain, (0.0, 0.0)), bead(quarter, (0.0, 0.0))
@@ -176,12 +205,15 @@ def test_quarter_column_offset_raises_the_resolution_at_the_isocentre(detector):
 @pytest.mark.extended
 @pytest.mark.parametrize("at", [(0.0, 0.0), (7.3, -4.1)])
 def test_interleaving_resolves_what_single_views_alias(at):
-    """Bars at 0.71 of the Nyquist frequency of the doubled sampling: contrast only with offset and interleaving."""
+    """Bars at 0.71 of the Nyquist frequency of the doubled sampling: contrast only with offset
+    and interleaving."""
     period = 1.4 / 1.754
 
     def modulation(offset: float, interleaved: bool) -> float:
         geometry = FanBeam(full_turn(360), 626, 1098, 80, 1.0, offset, "curved")
-        data = torch.stack([project(geometry, (at[0] + i * period, at[1]), 0.1, sub=16) for i in range(-3, 4)]).sum(0)
+        data = torch.stack(
+            [project(geometry, (at[0] + i * period, at[1]), 0.1, sub=16) for i in range(-3, 4)]
+        ).sum(0)
         if interleaved:
             data, geometry = interleave(data, geometry)
         half = VolumeGrid((1, 5), (1.0, period / 2), (at[1], at[0]))
@@ -208,7 +240,9 @@ def test_interleaved_gain_and_cone():
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("columns", [40, 400], ids=["fft", "matrix"])
 def test_nan_and_inf_reach_the_filtered_rows_and_fbp_bridges_them(bad, columns):
-    geometry = ConeBeam(full_turn(12), 600, 1000, columns, 3, (2.0, 400 / columns), detector="curved")
+    geometry = ConeBeam(
+        full_turn(12), 600, 1000, columns, 3, (2.0, 400 / columns), detector="curved"
+    )
     grid = VolumeGrid((2, 3, 3), 2.0)
     data = torch.ones(geometry.shape)
     data[5, 1, columns // 2] = bad
@@ -216,7 +250,9 @@ def test_nan_and_inf_reach_the_filtered_rows_and_fbp_bridges_them(bad, columns):
     assert not image[:, 1, 1].isfinite().any()
     with pytest.warns(UserWarning, match="1 of .* readings are NaN or Inf"):
         bridged = fbp(data, geometry, grid, outside=0.0)
-    torch.testing.assert_close(bridged, fbp(torch.ones(geometry.shape), geometry, grid, outside=0.0))
+    torch.testing.assert_close(
+        bridged, fbp(torch.ones(geometry.shape), geometry, grid, outside=0.0)
+    )
 
 
 def test_grids_and_the_field_of_view():
@@ -228,7 +264,9 @@ def test_grids_and_the_field_of_view():
     assert outside.any()
     assert (covering[torch.from_numpy(outside)] == 0).all()
     assert (covering[torch.from_numpy(~outside)] != 0).all()
-    with pytest.raises(ValueError, match=r"leaves the field of view of radius 5\d\.\d\d mm: move or shrink"):
+    with pytest.raises(
+        ValueError, match=r"leaves the field of view of radius 5\d\.\d\d mm: move or shrink"
+    ):
         fbp(data, geometry, VolumeGrid((10, 10), 2.0, (0.0, 50.0)))
     with pytest.raises(ValueError, match="beyond the source orbit"):
         fbp(data, geometry, VolumeGrid((10, 10), 2.0, (0.0, 620.0)))
@@ -265,7 +303,8 @@ from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, FanBeam, VolumeGrid, full_turn
 torch.set_num_threads(1)
 def peak():
-    return int(next(l for l in open("/proc/self/status") if l.startswith("VmHWM")).split()[1]) * 1024
+    line = next(l for l in open("/proc/self/status") if l.startswith("VmHWM"))
+    return int(line.split()[1]) * 1024
 inset = {inset}
 if inset:
     geometry = ConeBeam(full_turn(600), 626, 1098, 1500, 40, (0.5, 0.35), detector="curved")
@@ -275,7 +314,8 @@ else:
 small = geometry.select(slice(None, None, 20))
 fbp(torch.zeros(small.shape), small, grid)  # compile
 data = torch.zeros(geometry.shape) + 1.0
-getattr(ctypes.CDLL(None), "malloc_trim", int)(0)  # what compiling left free would be used again, unseen
+# What compiling left free would be used again, unseen.
+getattr(ctypes.CDLL(None), "malloc_trim", int)(0)
 with open("/proc/self/clear_refs", "w") as f:
     f.write("5")
 before = peak()

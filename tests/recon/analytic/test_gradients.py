@@ -21,8 +21,14 @@ pytestmark = pytest.mark.filterwarnings("ignore:the rows end inside the object")
 
 SHORT = np.arange(16) * (math.pi + 0.9) / 16 + 0.3
 CASES: dict[str, tuple[Geometry, VolumeGrid]] = {
-    "parallel": (ParallelBeam(np.arange(9) * math.pi / 9, 14, 1.1, 0.2), VolumeGrid((5, 6), 1.0, (0.4, -0.3))),
-    "fan-flat": (FanBeam(full_turn(9), 50, 90, 19, 1.3, 0.3), VolumeGrid((5, 6), (1.0, 0.8), (1.4, -2.3))),
+    "parallel": (
+        ParallelBeam(np.arange(9) * math.pi / 9, 14, 1.1, 0.2),
+        VolumeGrid((5, 6), 1.0, (0.4, -0.3)),
+    ),
+    "fan-flat": (
+        FanBeam(full_turn(9), 50, 90, 19, 1.3, 0.3),
+        VolumeGrid((5, 6), (1.0, 0.8), (1.4, -2.3)),
+    ),
     "fan-curved-short": (
         FanBeam(SHORT, 50, 90, 21, 1.3, -0.3, "curved"),
         VolumeGrid((5, 4), (1.0, 0.8), (1.4, -2.3)),
@@ -59,7 +65,9 @@ def reference_backprojection(geometry: Geometry, grid: VolumeGrid) -> torch.Tens
     axes = grid.axes
     z_axis = axes[0] if grid.ndim == 3 else np.zeros(1)
     rows = geometry.rows if isinstance(geometry, ConeBeam) else 1
-    matrix = np.zeros((z_axis.size, axes[-2].size, axes[-1].size, geometry.views, rows, geometry.columns))
+    matrix = np.zeros(
+        (z_axis.size, axes[-2].size, axes[-1].size, geometry.views, rows, geometry.columns)
+    )
     u = geometry.column_positions
     for v, beta in enumerate(geometry.angles):
         for iy, y in enumerate(axes[-2]):
@@ -123,7 +131,9 @@ def test_filter_transpose_is_exact(name):
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script.*")
 def test_gradients_of_first_and_second_order(case):
     geometry, grid = case
-    data = torch.randn(geometry.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    data = torch.randn(
+        geometry.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2)
+    )
     data.requires_grad_()
 
     def run(s: torch.Tensor) -> torch.Tensor:
@@ -135,7 +145,9 @@ def test_gradients_of_first_and_second_order(case):
 
 def test_vmap_and_leading_axes(case):
     geometry, grid = case
-    data = torch.randn((2, 3, *geometry.shape), dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    data = torch.randn(
+        (2, 3, *geometry.shape), dtype=torch.float64, generator=torch.Generator().manual_seed(3)
+    )
     whole = fbp(data, geometry, grid, ["soft", "ram-lak"])
     assert whole.shape == (2, 2, 3, *grid.shape)
     for i in range(2):
@@ -146,7 +158,9 @@ def test_vmap_and_leading_axes(case):
     torch.testing.assert_close(mapped, whole[0], rtol=0, atol=1e-12)
     strided = data.flip(1).transpose(-1, -2).contiguous().transpose(-1, -2)
     assert not strided.is_contiguous()
-    torch.testing.assert_close(fbp(strided, geometry, grid, "soft"), whole[0].flip(1), rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        fbp(strided, geometry, grid, "soft"), whole[0].flip(1), rtol=0, atol=1e-12
+    )
     assert fbp(data[:, :0], geometry, grid).shape == (2, 0, *grid.shape)
 
 
@@ -176,28 +190,42 @@ def test_modes_threads_and_buffers(case):
 @pytest.mark.parametrize("detector", ["flat", "curved"])
 def test_windows_change_nothing(columns, detector):
     """Filtering into, and out of, windows that follow an inset equals cropping the whole."""
-    geometry = ConeBeam(full_turn(24), 600, 1000, columns, 8, (2.0, 400 / columns), (0, 0.3), detector)
+    geometry = ConeBeam(
+        full_turn(24), 600, 1000, columns, 8, (2.0, 400 / columns), (0, 0.3), detector
+    )
     grid = VolumeGrid((4, 6, 5), 2.0, (1.0, 31.0, -25.0))
     window = footprint(geometry, grid, margin=1)
-    data = torch.randn((2, *geometry.shape), dtype=torch.float64, generator=torch.Generator().manual_seed(5))
-    index = torch.from_numpy(window.column_indices)[:, None, :].expand(24, window.rows, window.columns)
+    data = torch.randn(
+        (2, *geometry.shape), dtype=torch.float64, generator=torch.Generator().manual_seed(5)
+    )
+    index = torch.from_numpy(window.column_indices)[:, None, :].expand(
+        24, window.rows, window.columns
+    )
     rows = slice(window.first_row, window.first_row + window.rows)
 
     def crop(x: torch.Tensor) -> torch.Tensor:
-        return torch.take_along_dim(x[..., rows, :], index.expand(*x.shape[:-3], *index.shape), dim=-1)
+        return torch.take_along_dim(
+            x[..., rows, :], index.expand(*x.shape[:-3], *index.shape), dim=-1
+        )
 
     names = ("standard", "bone")
     whole = filter_sinogram(data, geometry, names)
     inside = filter_sinogram(data, geometry, names, window)
     torch.testing.assert_close(inside, crop(whole), rtol=0, atol=1e-12 * float(whole.abs().max()))
     volume = backproject(whole, geometry, grid)
-    torch.testing.assert_close(backproject(inside, geometry, grid, window), volume, rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        backproject(inside, geometry, grid, window), volume, rtol=0, atol=1e-12
+    )
     torch.testing.assert_close(fbp(data, geometry, grid, names), volume, rtol=0, atol=1e-12)
 
-    source = DetectorWindow(np.clip(window.first_column - 2, 0, None), window.columns, window.first_row, window.rows)
+    source = DetectorWindow(
+        np.clip(window.first_column - 2, 0, None), window.columns, window.first_row, window.rows
+    )
     small = torch.randn((2, 24, source.rows, source.columns), dtype=torch.float64)
     padded = torch.zeros((2, *geometry.shape), dtype=torch.float64)
-    place = torch.from_numpy(source.column_indices)[:, None, :].expand(2, 24, source.rows, source.columns)
+    place = torch.from_numpy(source.column_indices)[:, None, :].expand(
+        2, 24, source.rows, source.columns
+    )
     padded[:, :, rows] = padded[:, :, rows].scatter(-1, place, small)
     expected = crop(filter_sinogram(padded, geometry, names))
     actual = filter_sinogram(small, geometry, names, window, held=source)

@@ -35,8 +35,16 @@ def test_channels_take_batches_kernels_and_motion(spectral, run):
     (found,) = several.images(torch.stack([inside, 2 * inside]))
     assert found.shape == (2, 2, 2, *GRID.shape)
     torch.testing.assert_close(found[1, 0], run.images(inside)[0][0])
-    still = InsetFbp(clean, [GRID], ["soft", "standard"], surround=around, motion=np.zeros((clean.geometry.views, 3)))
-    torch.testing.assert_close(still.images(torch.stack([inside, 2 * inside]))[0], found, rtol=1e-5, atol=1e-5)
+    still = InsetFbp(
+        clean,
+        [GRID],
+        ["soft", "standard"],
+        surround=around,
+        motion=np.zeros((clean.geometry.views, 3)),
+    )
+    torch.testing.assert_close(
+        still.images(torch.stack([inside, 2 * inside]))[0], found, rtol=1e-5, atol=1e-5
+    )
 
 
 def test_refusals(spectral, run):
@@ -45,16 +53,23 @@ def test_refusals(spectral, run):
     spread = torch.zeros(3, w.views, w.rows, w.columns)
     refused(
         ("channels", lambda: run.images(inside[:1])),
-        ("surround must have the shape", lambda: InsetFbp(clean, [GRID], ["standard"], surround=around[..., :9])),
+        (
+            "surround must have the shape",
+            lambda: InsetFbp(clean, [GRID], ["standard"], surround=around[..., :9]),
+        ),
         ("decompose or sum", lambda: InsetFbp(clean, [GRID], ["standard"])),
         ("beyond the region", lambda: InsetFbp(clean, [beside], ["standard"], surround=around)),
-        ("ray_covariance", lambda: functional_covariance(run, torch.zeros(2, *GRID.shape), torch.zeros(2, 3))),
+        (
+            "ray_covariance",
+            lambda: functional_covariance(run, torch.zeros(2, *GRID.shape), torch.zeros(2, 3)),
+        ),
         ("functionals", lambda: functional_covariance(run, torch.zeros(2, 3), spread)),
     )
 
 
 def test_covariance_of_functionals_is_that_of_their_responses(spectral, run):
-    """h, the response of a functional to each reading, by differentiating the reconstruction: Cov = Σ h h C."""
+    """h, the response of a functional to each reading, by differentiating the reconstruction:
+    Cov = Σ h h C."""
     clean, _, inside, _ = spectral
     w = clean.window
     functionals = torch.zeros(2, *GRID.shape)
@@ -73,6 +88,8 @@ def test_covariance_of_functionals_is_that_of_their_responses(spectral, run):
     noise = torch.randn(inside.shape, generator=generator)
     response = values(inside + noise) - values(inside)
     expected = torch.stack([(a * n).sum() for n in noise.double() for a in h]).reshape(2, 2)
-    torch.testing.assert_close(response.double(), expected, rtol=1e-3, atol=1e-3 * float(expected.abs().max()))
+    torch.testing.assert_close(
+        response.double(), expected, rtol=1e-3, atol=1e-3 * float(expected.abs().max())
+    )
     sums = [[[float((a * b * v).sum()) for v in c.double()] for b in h] for a in h]
     np.testing.assert_allclose(functional_covariance(run, functionals, c), sums, rtol=1e-4)

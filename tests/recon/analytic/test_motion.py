@@ -23,7 +23,8 @@ from torchpcct.scene import Body, Scene, SinusoidalMotion
 from torchpcct.scene.bodies import Ellipsoid, EllipticCylinder
 
 ANGLES = full_turn(12, 0.2)
-PLANE, VOLUME = VolumeGrid((9, 7), 0.9, (6.0, -12.0)), VolumeGrid((6, 9, 7), 0.9, (0.5, 6.0, -12.0))
+PLANE = VolumeGrid((9, 7), 0.9, (6.0, -12.0))
+VOLUME = VolumeGrid((6, 9, 7), 0.9, (0.5, 6.0, -12.0))
 SCANS: dict[str, tuple[Any, VolumeGrid]] = {
     "parallel": (ParallelBeam(ANGLES, 60, 0.9, 0.1), PLANE),
     "fan": (FanBeam(ANGLES, 100.0, 180.0, 60, 1.6, 0.3), PLANE),
@@ -31,7 +32,10 @@ SCANS: dict[str, tuple[Any, VolumeGrid]] = {
     "cone": (ConeBeam(ANGLES, 100.0, 180.0, 60, 16, (1.1, 1.6), (0.2, 0.3)), VOLUME),
     "cone curved": (ConeBeam(ANGLES, 100.0, 180.0, 60, 16, (1.1, 1.6), detector="curved"), VOLUME),
     # heights change by rows within a tile: the kernel's other path
-    "steep": (ConeBeam(ANGLES, 40.0, 72.0, 96, 16, (0.9, 1.2), detector="curved"), replace(VOLUME, spacing=1.4)),
+    "steep": (
+        ConeBeam(ANGLES, 40.0, 72.0, 96, 16, (0.9, 1.2), detector="curved"),
+        replace(VOLUME, spacing=1.4),
+    ),
 }
 
 
@@ -51,11 +55,14 @@ def test_each_view_sees_the_grid_where_it_is_then(name, dtype, tolerance):
     motion = _path(grid.ndim)
     data = torch.randn(2, *geometry.shape, dtype=dtype, generator=torch.Generator().manual_seed(0))
     parts = [
-        backproject(data[:, v : v + 1], geometry.select([v]), _moved(grid, motion[v])) for v in range(geometry.views)
+        backproject(data[:, v : v + 1], geometry.select([v]), _moved(grid, motion[v]))
+        for v in range(geometry.views)
     ]
     expected = torch.stack(parts).sum(0)
     found = backproject(data, geometry, grid, motion=motion)
-    torch.testing.assert_close(found, expected, rtol=0, atol=tolerance * float(expected.abs().max()))
+    torch.testing.assert_close(
+        found, expected, rtol=0, atol=tolerance * float(expected.abs().max())
+    )
     rest = backproject(data, geometry, grid)
     assert torch.equal(backproject(data, geometry, grid, motion=np.zeros_like(motion)), rest)
     assert (rest - found).abs().max() > 0.1 * found.abs().max()
@@ -67,7 +74,11 @@ def test_transpose_through_a_window(name):
     motion = _path(grid.ndim)
     window = footprint(geometry, grid, margin=1, motion=motion)
     plan = BackprojectionPlan(geometry, grid, window, motion)
-    shape = (window.views, window.rows, window.columns) if grid.ndim == 3 else (window.views, window.columns)
+    shape = (
+        (window.views, window.rows, window.columns)
+        if grid.ndim == 3
+        else (window.views, window.columns)
+    )
     assert mismatch(plan.forward, plan.transpose, shape, grid.shape) <= 1e-13
 
 
@@ -81,7 +92,9 @@ def test_a_moving_body_is_shown_at_rest(name):
     grid = VolumeGrid((3, 7, 7)[-grid.ndim :], 0.5, (0.0, *grid.center[-2:])[-grid.ndim :])
     phase = np.arange(views) / views * 2.2
     # in the plane: FDK is exact for no other motion
-    motion = np.stack([0.0 * phase, 1.1 * np.sin(phase), 2.0 * np.cos(phase)], axis=1)[:, -grid.ndim :]
+    motion = np.stack([0.0 * phase, 1.1 * np.sin(phase), 2.0 * np.cos(phase)], axis=1)[
+        :, -grid.ndim :
+    ]
     body = Gaussian(tuple(c + 0.3 for c in grid.center), (1.5,) * grid.ndim, 0.0, 0.02)
 
     def at(v: int) -> np.ndarray:
@@ -108,16 +121,28 @@ def _scene(amplitude: float) -> Scene:
     x, y = CENTER[2], CENTER[1]
     bodies = (
         Body("patient", EllipticCylinder(60.0), "pericoronary_fat"),
-        Body("vessel", Ellipsoid((1.6, 1.6, 6.0), position=(x, y, 0.0)), "fibrous_tissue", "patient"),
-        Body("lumen", Ellipsoid((0.9, 0.9, 5.0), position=(x + 0.3, y, 0.0)), "blood_iodine", "vessel"),
+        Body(
+            "vessel", Ellipsoid((1.6, 1.6, 6.0), position=(x, y, 0.0)), "fibrous_tissue", "patient"
+        ),
+        Body(
+            "lumen",
+            Ellipsoid((0.9, 0.9, 5.0), position=(x + 0.3, y, 0.0)),
+            "blood_iodine",
+            "vessel",
+        ),
     )
-    return Scene(bodies, SinusoidalMotion("vessel", amplitude, direction=0.4) if amplitude else None)
+    return Scene(
+        bodies, SinusoidalMotion("vessel", amplitude, direction=0.4) if amplitude else None
+    )
 
 
 @pytest.fixture(scope="module")
 def scans():
     scanner = presets.pcct(views=300, rows=8, columns=700)
-    return {a: acquire(_scene(a), scanner, region=GRID, rotation_s=TURN_S, sub_rays=16) for a in (0.0, 2.0)}
+    return {
+        a: acquire(_scene(a), scanner, region=GRID, rotation_s=TURN_S, sub_rays=16)
+        for a in (0.0, 2.0)
+    }
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +183,8 @@ def test_compensated_pwls_shows_the_inset_at_rest(scans, path):
     same = InsetProblem(scans[2.0], GRID, nodes=1).with_motion(path)
     assert torch.equal(same.data(scans[2.0]), moved.data(scans[2.0]))
     assert moved.with_motion(None).window == problem.window != moved.window
-    # The Gram holds for the moving operator about as well as for the one at rest; its weights move along.
+    # The Gram holds for the moving operator about as well as for the one at rest; its weights move
+    # along.
     x = rest[0] - rest.min()
     errors = []
     for gram, p in ((problem.gram, problem), (moved.gram, moved), (problem.gram, moved)):
@@ -172,12 +198,27 @@ def test_compensated_pwls_shows_the_inset_at_rest(scans, path):
 def test_refusals(scans, path):
     geometry, grid = SCANS["fan"]
     data, narrow = torch.zeros(geometry.shape), DetectorWindow(np.full(12, 15), 30)
-    whole = replace(scans[0.0], window=None, surround=None, region=None, counts=torch.ones(scans[0.0].geometry.shape))
+    whole = replace(
+        scans[0.0],
+        window=None,
+        surround=None,
+        region=None,
+        counts=torch.ones(scans[0.0].geometry.shape),
+    )
     refused(
-        (r"motion needs the shape \(12, 2\)", lambda: backproject(data, geometry, grid, motion=np.zeros((12, 3)))),
+        (
+            r"motion needs the shape \(12, 2\)",
+            lambda: backproject(data, geometry, grid, motion=np.zeros((12, 3))),
+        ),
         ("not finite", lambda: backproject(data, geometry, grid, motion=np.full((12, 2), np.inf))),
-        ("leaves the field of view", lambda: backproject(data, geometry, grid, motion=np.full((12, 2), 30.0))),
-        ("misses columns", lambda: backproject(data[:, :30], geometry, grid, narrow, motion=np.full((12, 2), 4.0))),
+        (
+            "leaves the field of view",
+            lambda: backproject(data, geometry, grid, motion=np.full((12, 2), 30.0)),
+        ),
+        (
+            "misses columns",
+            lambda: backproject(data[:, :30], geometry, grid, narrow, motion=np.full((12, 2), 4.0)),
+        ),
         ("rotation_s", lambda: view_motion(SinusoidalMotion("vessel", 1.0), geometry, 0.0)),
         ("surround at rest", lambda: InsetFbp(whole, [GRID], ["soft"], motion=path)),
     )

@@ -48,7 +48,9 @@ def test_the_equiangular_kernel_is_the_closed_form():
     alpha, m = 0.01, np.arange(1, 9, 2)
     h = ramp_kernel(9, alpha, equiangular=True)
     np.testing.assert_allclose(h[m], -1 / (np.pi * np.sin(m * alpha)) ** 2, rtol=1e-12)
-    np.testing.assert_allclose(h[::2], [1 / (4 * alpha**2), 0, 0, 0, 0], rtol=1e-12, atol=1e-12 / alpha**2)
+    np.testing.assert_allclose(
+        h[::2], [1 / (4 * alpha**2), 0, 0, 0, 0], rtol=1e-12, atol=1e-12 / alpha**2
+    )
 
 
 @settings(max_examples=40, deadline=None)

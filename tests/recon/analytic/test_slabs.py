@@ -1,4 +1,5 @@
-"""Volumes slab by slab: the same bits as in one piece, within a limit of memory, and nothing half written."""
+"""Volumes slab by slab: the same bits as in one piece, within a limit of memory, and nothing
+half written."""
 
 import errno
 import math
@@ -19,14 +20,24 @@ from refusals import refused
 import recon
 from recon.analytic import slabs
 from recon.analytic.slabs import ScanSlices, plan_slabs, reconstruct_to
-from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, Scan, Volume, VolumeGrid, full_turn
+from torchpcct import (
+    ConeBeam,
+    FanBeam,
+    ParallelBeam,
+    Projector,
+    Scan,
+    Volume,
+    VolumeGrid,
+    full_turn,
+)
 from torchpcct.files import WriteError
 from torchpcct.formats.scans import open_scan
 from torchpcct.formats.volume_slabs import SlabFile
 
 CONE = ConeBeam(full_turn(60), 200.0, 300.0, 64, 40, 1.5)
 PARALLEL = ParallelBeam(np.arange(50) * math.pi / 50, 64, 1.0)
-GRID, STACK = VolumeGrid((24, 40, 40), 1.0), VolumeGrid((6, 40, 40), 1.0)
+GRID = VolumeGrid((24, 40, 40), 1.0)
+STACK = VolumeGrid((6, 40, 40), 1.0)
 
 
 @pytest.fixture(autouse=True)
@@ -37,10 +48,13 @@ def _small(monkeypatch):
 
 
 def made(geometry, slices=0, radius=14.0, dead=False, **more):
-    """Poisson counts of a ball (of a stack: a disk) with a dense detail, read by cells of which some are broken."""
+    """Poisson counts of a ball (of a stack: a disk) with a dense detail, read by cells of which
+    some are broken."""
     grid = VolumeGrid((40, 64, 64) if geometry.has_rows else (64, 64), 1.0)
     *z, y, x = np.meshgrid(*grid.axes, indexing="ij")
-    body = 0.02 * ((x - 2) ** 2 + y**2 + sum(0.3 * v**2 for v in z) < radius**2) + 0.03 * (np.hypot(x - 4, y + 5) < 3)
+    body = 0.02 * ((x - 2) ** 2 + y**2 + sum(0.3 * v**2 for v in z) < radius**2) + 0.03 * (
+        np.hypot(x - 4, y + 5) < 3
+    )
     lines = Projector(geometry, grid)(torch.from_numpy(body).float())
     if slices:
         lines = torch.stack([lines * (0.5 + 0.1 * k) for k in range(slices)])
@@ -69,26 +83,50 @@ def slabs_and_whole(scan, grid, path, memory, method="fbp", source=None):
 
 CASES = {
     "cone with broken cells": (CONE, GRID, {"dead": True}, 4_500_000),
-    "offset curved detector": (replace(CONE, offset=(3.0, 14.0), detector="curved"), GRID, {}, 4_200_000),
+    "offset curved detector": (
+        replace(CONE, offset=(3.0, 14.0), detector="curved"),
+        GRID,
+        {},
+        4_200_000,
+    ),
     "rows that end inside": (CONE, GRID, {"radius": 30.0}, 4_600_000),
     # Heights change by rows within a tile: the backprojection looks its rows up one by one.
-    "wide cone": (ConeBeam(full_turn(60), 50.0, 80.0, 80, 60, 1.0), VolumeGrid((20, 30, 30), 1.0), {}, 7_500_000),
-    "grid beyond the field of view": (CONE, VolumeGrid((24, 80, 80), 1.0, (2.0, 0.0, 0.0)), {}, 4_200_000),
+    "wide cone": (
+        ConeBeam(full_turn(60), 50.0, 80.0, 80, 60, 1.0),
+        VolumeGrid((20, 30, 30), 1.0),
+        {},
+        7_500_000,
+    ),
+    "grid beyond the field of view": (
+        CONE,
+        VolumeGrid((24, 80, 80), 1.0, (2.0, 0.0, 0.0)),
+        {},
+        4_200_000,
+    ),
     "parallel stack": (PARALLEL, STACK, {"slices": 6, "dead": True}, 250_000),
-    "fan stack": (FanBeam(full_turn(50), 200.0, 300.0, 64, 1.5), STACK, {"slices": 6, "dead": True}, 250_000),
+    "fan stack": (
+        FanBeam(full_turn(50), 200.0, 300.0, 64, 1.5),
+        STACK,
+        {"slices": 6, "dead": True},
+        250_000,
+    ),
 }
 
 
 @pytest.mark.parametrize(
     "case",
     [
-        c if c in ("cone with broken cells", "parallel stack") else pytest.param(c, marks=pytest.mark.extended)
+        c
+        if c in ("cone with broken cells", "parallel stack")
+        else pytest.param(c, marks=pytest.mark.extended)
         for c in CASES
     ],
 )
 def test_slabs_are_the_whole_volume(case, tmp_path):
     geometry, grid, options, memory = CASES[case]
-    report, volume, whole = slabs_and_whole(made(geometry, **options), grid, tmp_path / "v.nii", memory)
+    report, volume, whole = slabs_and_whole(
+        made(geometry, **options), grid, tmp_path / "v.nii", memory
+    )
     assert float((volume.data - whole.data).abs().max()) <= 1e-4
     assert volume.grid == whole.grid
     assert report["dead_readings"] == whole.report["dead_readings"]
@@ -108,16 +146,25 @@ def test_pwls_of_a_stack(tmp_path):
 
 def _files(scan, folder):
     """The same parallel-beam readings in every format that is read in parts, with their options."""
-    images = scan.counts.movedim(0, 1).numpy().astype(np.uint16)  # as a camera takes them, view by view
+    # as a camera takes them, view by view
+    images = scan.counts.movedim(0, 1).numpy().astype(np.uint16)
     scan.save(folder / "own.h5")
-    data_exchange(folder / "exchange.h5", images, np.full((1, *images.shape[1:]), 2e4), PARALLEL.angles, None, 1000.0)
+    data_exchange(
+        folder / "exchange.h5",
+        images,
+        np.full((1, *images.shape[1:]), 2e4),
+        PARALLEL.angles,
+        None,
+        1000.0,
+    )
     np.save(folder / "images.npy", images)
     tifffile.imwrite(folder / "images.tif", images, photometric="minisblack")
     zarr.create_array(folder / "images.zarr", data=images)
     for k, image in enumerate(images):
         tifffile.imwrite(folder / f"image{k:03}.tiff", image)
     text = (
-        "readings: '{}'\nkind: counts\nair: 20000\ngain: 1.0\nmu_water: 0.02\ngeometry: {{kind: parallel, columns: 64, "
+        "readings: '{}'\nkind: counts\nair: 20000\ngain: 1.0\nmu_water: 0.02\ngeometry: "
+        "{{kind: parallel, columns: 64, "
     )
     text += "pitch: 1, angles_deg: {{start: 0, step: 3.6, count: 50}}}}\n"
     for name in ("images.npy", "images.tif", "images.zarr", "*.tiff"):
@@ -128,12 +175,17 @@ def _files(scan, folder):
 
 def test_files_are_read_in_parts(tmp_path):
     for name, options in _files(made(PARALLEL, slices=6), tmp_path).items():
-        whole, source = open_scan(tmp_path / name, **options), ScanSlices(tmp_path / name, **options)
+        whole, source = (
+            open_scan(tmp_path / name, **options),
+            ScanSlices(tmp_path / name, **options),
+        )
         assert (source.count, source.counts.shape) == (6, whole.counts.shape)
         torch.testing.assert_close(
             source.read(2, 5).scan.line_integrals(), whole.line_integrals()[2:5], atol=1e-6, rtol=0
         )
-    _, volume, whole = slabs_and_whole(whole, STACK, tmp_path / "v.nii", 250_000, source=tmp_path / "zarr.yaml")
+    _, volume, whole = slabs_and_whole(
+        whole, STACK, tmp_path / "v.nii", 250_000, source=tmp_path / "zarr.yaml"
+    )
     assert float((volume.data - whole.data).abs().max()) <= 1e-4
 
 
@@ -143,13 +195,16 @@ def test_rows_of_a_cone_beam_are_read_in_parts(tmp_path):
     np.save(tmp_path / "images.npy", scan.counts.numpy())
     np.save(tmp_path / "dead.npy", scan.dead.numpy())
     (tmp_path / "scan.yaml").write_text(
-        "readings: images.npy\ndead: dead.npy\nkind: counts\nair: 20000\ngain: 1.0\nmu_water: 0.02\n"
+        "readings: images.npy\ndead: dead.npy\nkind: counts\nair: 20000\ngain: 1.0\nmu_water: "
+        "0.02\n"
         "geometry: {kind: cone, sod: 200, sdd: 300, columns: 64, rows: 40, pitch: 1.5, "
         "angles_deg: {start: 0, step: 6, count: 60}}\n"
     )
     for name in ("own.h5", "scan.yaml"):
         part = open_scan(tmp_path / name, slices=slice(10, 17))
-        np.testing.assert_allclose(part.geometry.row_positions, CONE.row_positions[10:17], atol=1e-12)
+        np.testing.assert_allclose(
+            part.geometry.row_positions, CONE.row_positions[10:17], atol=1e-12
+        )
         assert torch.equal(part.counts, scan.counts[:, 10:17])
         assert torch.equal(part.dead, scan.dead[:, 10:17])
         assert part.info["slices"] == [10, 17, 40]
@@ -163,7 +218,9 @@ def test_no_more_than_a_band_is_in_memory(tmp_path, monkeypatch):
     plan = plan_slabs(CONE, GRID, 4_200_000)
     most, opened = max(high - low for low, high in plan.bands), []
     read = open_scan
-    monkeypatch.setattr(slabs, "open_scan", lambda *a, **k: opened.append(read(*a, **k)) or opened[-1])
+    monkeypatch.setattr(
+        slabs, "open_scan", lambda *a, **k: opened.append(read(*a, **k)) or opened[-1]
+    )
     report = reconstruct_to(tmp_path / "scan.h5", GRID, tmp_path / "v.nii", memory=4_200_000)
     assert report["memory_bytes"] <= 4_200_000
     rows = [part.geometry.rows for part in opened]
@@ -173,7 +230,9 @@ def test_no_more_than_a_band_is_in_memory(tmp_path, monkeypatch):
 
 def test_a_limit_that_is_too_small_names_the_smallest_that_works(tmp_path):
     scan = made(CONE)
-    with pytest.raises(ValueError, match=r"memory=1MB is too little.*give memory=\d+MB or more") as error:
+    with pytest.raises(
+        ValueError, match=r"memory=1MB is too little.*give memory=\d+MB or more"
+    ) as error:
         reconstruct_to(scan, GRID, tmp_path / "v.nii", memory="1MB")
     smallest = re.search(r"give memory=(\d+)MB", str(error.value))[1]
     reconstruct_to(scan, GRID, tmp_path / "v.nii", memory=f"{smallest}MB")
@@ -187,7 +246,8 @@ def test_a_limit_that_is_too_small_names_the_smallest_that_works(tmp_path):
 @pytest.mark.extended
 @pytest.mark.parametrize("name", ["v.nii", "v.zarr"])
 def test_killed_between_slabs(name, tmp_path, monkeypatch):
-    """The finished slabs stay under a name that is not the volume's, and the next call goes on with them."""
+    """The finished slabs stay under a name that is not the volume's, and the next call goes on
+    with them."""
     scan, path, memory = made(CONE), tmp_path / name, 4_200_000
     write = SlabFile.write
 
@@ -246,10 +306,16 @@ def test_what_slabs_do_not_do_is_refused_by_name(tmp_path):
     refused(
         ("couples all slices", lambda: reconstruct_to(scan, GRID, path, "pwls")),
         ("unknown method 'mbir'", lambda: reconstruct_to(scan, GRID, path, "mbir")),
-        (r"v\.nii\.gz' cannot be written slab", lambda: reconstruct_to(scan, GRID, tmp_path / "v.nii.gz")),
+        (
+            r"v\.nii\.gz' cannot be written slab",
+            lambda: reconstruct_to(scan, GRID, tmp_path / "v.nii.gz"),
+        ),
         ("needs a grid of as many", lambda: reconstruct_to(made(PARALLEL, slices=6), GRID, path)),
         ("read slice by slice", lambda: reconstruct_to(tmp_path / "s.prep", GRID, path)),
-        ("dead near row", lambda: reconstruct_to(replace(scan, dead=dead), GRID, path, memory=4_200_000)),
+        (
+            "dead near row",
+            lambda: reconstruct_to(replace(scan, dead=dead), GRID, path, memory=4_200_000),
+        ),
         ("4 axes", lambda: reconstruct_to(bins, GRID, path)),
     )
     assert not list(tmp_path.iterdir())
@@ -265,7 +331,10 @@ def test_ome_zarr_says_where_it_lies(tmp_path):
     assert group.attrs["ome"]["version"] == "0.5"
     assert image["axes"] == [{"name": n, "type": "space", "unit": "millimeter"} for n in "zyx"]
     scale, translation = image["datasets"][0]["coordinateTransformations"]
-    assert (scale["scale"], translation["translation"]) == ([1.5, 0.5, 0.25], [float(a[0]) for a in grid.axes])
+    assert (scale["scale"], translation["translation"]) == (
+        [1.5, 0.5, 0.25],
+        [float(a[0]) for a in grid.axes],
+    )
     array = group[image["datasets"][0]["path"]]
     assert array.metadata.dimension_names == ("z", "y", "x")
     np.testing.assert_array_equal(array[...], data.numpy())
@@ -289,18 +358,24 @@ def test_a_folder_with_files_of_others_is_not_replaced(tmp_path, name):
         (folder / name).write_text("mine")
     before = {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")}
     for write in (volume.save, lambda path: SlabFile(path, grid, "HU", "key", 1)):
-        with pytest.raises(FileExistsError, match="link to a folder" if name == "link" else "did not write there"):
+        with pytest.raises(
+            FileExistsError, match="link to a folder" if name == "link" else "did not write there"
+        ):
             write(folder)
     assert {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")} == before
 
 
-@pytest.mark.parametrize("name", ["v.nii.unfinished", "v.nii.unfinished.json", "v.zarr.unfinished/notes.txt"])
+@pytest.mark.parametrize(
+    "name", ["v.nii.unfinished", "v.nii.unfinished.json", "v.zarr.unfinished/notes.txt"]
+)
 def test_files_of_others_with_the_names_of_an_unfinished_volume_stay(tmp_path, name):
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     path.write_text('{"key": "mine"}')
     with pytest.raises(FileExistsError, match="is no unfinished volume of torchpcct: move it"):
-        SlabFile(tmp_path / name.partition(".unfinished")[0], VolumeGrid((3, 4, 5), 1.0), "HU", "key", 1)
+        SlabFile(
+            tmp_path / name.partition(".unfinished")[0], VolumeGrid((3, 4, 5), 1.0), "HU", "key", 1
+        )
     assert [p.name for p in tmp_path.rglob("*") if p.is_file()] == [path.name]
     assert path.read_text() == '{"key": "mine"}'
 
@@ -314,7 +389,10 @@ def test_nifti_is_that_of_a_whole_volume(tmp_path):
 
 
 def test_the_plan_of_a_volume_of_2048_cubed():
-    geometry, grid = ParallelBeam(np.arange(3000) * math.pi / 3000, 2048, 0.01), VolumeGrid((2048, 2048, 2048), 0.01)
+    geometry, grid = (
+        ParallelBeam(np.arange(3000) * math.pi / 3000, 2048, 0.01),
+        VolumeGrid((2048, 2048, 2048), 0.01),
+    )
     plan = plan_slabs(geometry, grid, "4GB")
     assert plan.memory <= 4e9
     assert plan.written == 4 * 2048**3
@@ -322,7 +400,9 @@ def test_the_plan_of_a_volume_of_2048_cubed():
     assert plan.slabs[0][0] == 0
     assert plan.slabs[-1][1] == 2048
     assert all(a[1] == b[0] for a, b in zip(plan.slabs, plan.slabs[1:], strict=False))
-    assert re.search(r"\d+ slabs of up to \d+ slices, .* writes 34\.36 GB, about \d+ s on one core", str(plan))
+    assert re.search(
+        r"\d+ slabs of up to \d+ slices, .* writes 34\.36 GB, about \d+ s on one core", str(plan)
+    )
 
 
 def test_on_the_command_line(here, cli):
@@ -349,7 +429,8 @@ print(next(line.split()[1] for line in open("/proc/self/status") if line.startsw
 
 @pytest.mark.slow
 def test_512_cubed_within_a_gigabyte(tmp_path):
-    """Of the process, with all that it imports (some 0.4 GB): the volume and the readings are 0.5 and 0.25 GB.
+    """Of the process, with all that it imports (some 0.4 GB): the volume and the readings are 0.5
+    and 0.25 GB.
 
     The limit counts what is asked for, ``memory`` what is used."""
     geometry = ConeBeam(full_turn(240), 400.0, 600.0, 512, 512, 0.375)
@@ -360,7 +441,11 @@ def test_512_cubed_within_a_gigabyte(tmp_path):
         ray = np.stack([-600 * c - u * s, -600 * s + u * c, v], -1)
         ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
         lines = 0.0
-        for mu, radius, at in ((0.02, 45.0, (0, 0, 0)), (0.01, 8.0, (20, 10, 15)), (0.03, 6.0, (-25, 5, -30))):
+        for mu, radius, at in (
+            (0.02, 45.0, (0, 0, 0)),
+            (0.01, 8.0, (20, 10, 15)),
+            (0.03, 6.0, (-25, 5, -30)),
+        ):
             source = np.array([400 * c, 400 * s, 0.0]) - at
             along = ray @ source
             lines = lines + 2 * mu * np.sqrt(np.maximum(along**2 - source @ source + radius**2, 0))

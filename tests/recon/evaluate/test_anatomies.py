@@ -1,4 +1,5 @@
-"""Anatomies that break assumptions: each feature is there, in the tissue it belongs to, and the base is not changed."""
+"""Anatomies that break assumptions: each feature is there, in the tissue it belongs to, and the
+base is not changed."""
 
 import math
 from dataclasses import replace
@@ -53,7 +54,9 @@ def test_the_feature_is_all_that_differs(name):
     def differs(points):
         return np.not_equal(*what.labels(points)).astype(int)
 
-    assert label_fractions(differs, 2, COARSE)[1].sum() * 0.4**3 > 0.05, "a feature of 0.05 mm³ or more"
+    assert label_fractions(differs, 2, COARSE)[1].sum() * 0.4**3 > 0.05, (
+        "a feature of 0.05 mm³ or more"
+    )
     assert changed <= {part.tissue for part in what.feature}
     # The inset holds it: nothing differs at its rim along x and y.
     different = with_ != without
@@ -64,9 +67,17 @@ def test_the_feature_is_all_that_differs(name):
 def test_features_have_the_sizes_they_are_said_to_have():
     def volume_mm3(name, tissue):
         shares = anatomy(name).shares(VolumeGrid((12, 12, 12), 0.4))
-        return sum(float(own.sum()) for (after, before), own in shares.items() if after == tissue != before) * 0.4**3
+        return (
+            sum(
+                float(own.sum())
+                for (after, before), own in shares.items()
+                if after == tissue != before
+            )
+            * 0.4**3
+        )
 
-    # A ball of 0.5 mm that lies across the wall's two faces, one of 1.1 mm that the lumen's wall cuts.
+    # A ball of 0.5 mm that lies across the wall's two faces, one of 1.1 mm that the lumen's wall
+    # cuts.
     assert 0.3 < volume_mm3("calcification", "calcium") / (math.pi / 6 * 0.5**3) < 1.0
     assert 0.7 < volume_mm3("thrombus", "thrombus") / (math.pi / 6 * 1.1**3) < 1.0
     a, b, c = ANATOMIES["core"].feature[0].inside.__closure__[0].cell_contents.semi_axes
@@ -78,8 +89,11 @@ def test_shares_are_those_of_the_labels_and_painting_is_their_mean():
     shares = what.shares(grid)
     np.testing.assert_allclose(np.sum(list(shares.values()), axis=0), 1.0, atol=1e-12)
     assert {pair for pair in shares if pair[0] != pair[1]} == {
-        ("wall", "fat"), ("lumen", "fat"), ("lumen", "wall"), ("lumen", "fibrous"),
-    }  # fmt: skip
+        ("wall", "fat"),
+        ("lumen", "fat"),
+        ("lumen", "wall"),
+        ("lumen", "fibrous"),
+    }
     names, (with_, without) = list(what.values), what.labels(voxel_centres(grid))
     for pair, share in shares.items():
         # A voxel that a tissue fills has it in its middle.
@@ -87,7 +101,9 @@ def test_shares_are_those_of_the_labels_and_painting_is_their_mean():
         assert (with_[full] == names.index(pair[0])).all()
         assert (without[full] == names.index(pair[1])).all()
     painted = what.painted(grid, {"lumen": 10.0, "wall": 2.0}, feature=False)
-    lumen, wall = (sum(own for (_, before), own in shares.items() if before == t) for t in ("lumen", "wall"))
+    lumen, wall = (
+        sum(own for (_, before), own in shares.items() if before == t) for t in ("lumen", "wall")
+    )
     np.testing.assert_allclose(painted, 10.0 * lumen + 2.0 * wall)
     with pytest.raises(ValueError, match="ulcer"):
         anatomy("ulcre")
@@ -100,7 +116,8 @@ def test_what_the_task_of_an_anatomy_reads_is_its_truth(few):
     np.testing.assert_allclose(np.sum(list(few.shares.values()), axis=0), 1.0, atol=1e-12)
     present, absent = (t.double().numpy() for t in few.truth(facts))
     change = present - absent
-    # What changes is the feature, in proportion to its share: calcium for wall or for fibrous tissue.
+    # What changes is the feature, in proportion to its share: calcium for wall or for fibrous
+    # tissue.
     signal = few.shares["signal"]
     np.testing.assert_array_equal(change == 0.0, signal == 0.0)
     steps = [TISSUES_HU["calcium"] - TISSUES_HU[t] for t in ("fibrous", "wall")]
@@ -116,10 +133,13 @@ def test_what_the_task_of_an_anatomy_reads_is_its_truth(few):
 
 @pytest.mark.extended
 def test_the_scan_of_an_anatomy_holds_what_is_painted(few, tmp_path):
-    """By the projection of the true volume, whose voxels are twice as large as those that were projected."""
+    """By the projection of the true volume, whose voxels are twice as large as those that were
+    projected."""
     store = Store(tmp_path)
     facts = few.facts(store)
-    assert dict(zip(facts.tissues, facts.values_hu, strict=True))["signal"] == pytest.approx(TISSUES_HU["calcium"])
+    assert dict(zip(facts.tissues, facts.values_hu, strict=True))["signal"] == pytest.approx(
+        TISSUES_HU["calcium"]
+    )
     assert facts.limit_hu > 0
     present, absent = few.scans(store)
     change = present.line_integrals() - absent.line_integrals()
@@ -140,12 +160,18 @@ def test_the_scan_of_an_anatomy_holds_what_is_painted(few, tmp_path):
         ({"vessel": "tilted"}, "different kinds of task"),
         ({"inset": {"size": [2, 6, 6]}}, "needs center"),
         (
-            {"scene": {"kind": "bodies", "bodies": [
-                {"name": "wall", "shape": "cylinder", "semi_axes": 60, "material": "water"}]}},
+            {
+                "scene": {
+                    "kind": "bodies",
+                    "bodies": [
+                        {"name": "wall", "shape": "cylinder", "semi_axes": 60, "material": "water"}
+                    ],
+                }
+            },
             "wall is a tissue and a body",
         ),
     ],
-)  # fmt: skip
+)
 def test_anatomies_that_make_no_task(change, said, tmp_path):
     path = tmp_path / "other.yaml"
     path.write_text(yaml.safe_dump({**yaml.safe_load(FEW), **change}), encoding="utf-8")
@@ -155,13 +181,24 @@ def test_anatomies_that_make_no_task(change, said, tmp_path):
 
 def test_broken_anatomies_are_ready_tasks():
     kinds = {read_task(name).anatomy for name in BROKEN}
-    assert kinds >= {"ulcer", "thrombus", "flap", "calcification", "stent", "inflamed_30", "branch", "healthy"}
+    assert kinds >= {
+        "ulcer",
+        "thrombus",
+        "flap",
+        "calcification",
+        "stent",
+        "inflamed_30",
+        "branch",
+        "healthy",
+    }
 
 
 def test_the_muscle_that_a_vessel_lies_on_is_no_body():
     """So figures of the vessel are those of the same vessel in fat."""
     whole = read_task("plaque_on_muscle")
-    beside = replace(whole, grid=VolumeGrid((12, *whole.grid.shape[1:]), whole.grid.spacing, whole.grid.center))
+    beside = replace(
+        whole, grid=VolumeGrid((12, *whole.grid.shape[1:]), whole.grid.spacing, whole.grid.center)
+    )
     muscle = beside.shares["muscle"]
     assert (muscle[:, :, :8] == 1.0).all()
     assert not beside.near[:, :, :8].any()

@@ -56,7 +56,13 @@ def shrunk(volume, sigma):
 
 @pytest.fixture(scope="module")
 def found(task, folder):
-    methods = ["fbp:soft", "fbp:detail", "gaussian@fbp:soft", denoiser(shrunk, "fbp:soft"), Method("mine", run_half)]
+    methods = [
+        "fbp:soft",
+        "fbp:detail",
+        "gaussian@fbp:soft",
+        denoiser(shrunk, "fbp:soft"),
+        Method("mine", run_half),
+    ]
     return evaluate(task, methods, n=16, folder=folder)
 
 
@@ -65,7 +71,11 @@ def run_half(draw):
 
 
 def value(found, figure, method, where):
-    (record,) = [r for r in found.records if (r["figure"], r["method"], r["where"]) == (figure, method, where)]
+    (record,) = [
+        r
+        for r in found.records
+        if (r["figure"], r["method"], r["where"]) == (figure, method, where)
+    ]
     return record
 
 
@@ -75,12 +85,17 @@ def test_ready_tasks_have_regions(name):
     assert ready.title
     if isinstance(ready, AnatomyTask | VesselTask):
         # Painting takes seconds; the signal lies in the middle.
-        ready = replace(ready, grid=VolumeGrid((16, *ready.grid.shape[1:]), ready.grid.spacing, ready.grid.center))
+        ready = replace(
+            ready,
+            grid=VolumeGrid((16, *ready.grid.shape[1:]), ready.grid.spacing, ready.grid.center),
+        )
     for signal, background in ready.regions.values():
         assert float(signal.sum()) == pytest.approx(1.0)
         assert float(background.sum()) == pytest.approx(1.0)
         # No voxel is read as both.
-        assert not bool(((signal > 1e-3) & (background > 1e-3)).any()) or name.startswith(("plaque", "half_contrast"))
+        assert not bool(((signal > 1e-3) & (background > 1e-3)).any()) or name.startswith(
+            ("plaque", "half_contrast")
+        )
     for mask in (ready.near, ready.beside, ready.quiet):
         assert mask.any()
     assert yaml.safe_load(task_text(name))["signal"]
@@ -110,8 +125,12 @@ def test_exact_variance_is_that_of_draws(task, folder):
     """FBP passed off as a nonlinear method: drawn figures about the exact ones."""
     other = Method("drawn", lambda draw: draw.fbp("detail"), kernels=("detail",))
     both = evaluate(task, ["fbp:detail", other], n=40, folder=folder)
-    for figure, where in (("contrast SD at slope 1", "lesion"), ("CNR", "small"), ("slope", "slice"),
-                          ("contrast without signal", "small")):  # fmt: skip
+    for figure, where in (
+        ("contrast SD at slope 1", "lesion"),
+        ("CNR", "small"),
+        ("slope", "slice"),
+        ("contrast without signal", "small"),
+    ):
         exact, drawn = (value(both, figure, name, where) for name in ("fbp:detail", "drawn"))
         half = (drawn["high"] - drawn["low"]) / 2
         assert abs(drawn["value"] - exact["value"]) <= 2.0 * half + 1e-6, figure
@@ -125,8 +144,12 @@ def test_a_users_denoiser_and_reconstruction(found):
     factor = value(found, "dose factor: contrast at slope 1", "shrunk@fbp:soft", "lesion")
     assert factor["low"] < 1.02
     assert factor["high"] > 0.98
-    assert value(found, "dose factor: noise", "shrunk@fbp:soft", "patient")["value"] == pytest.approx(4.0, rel=0.02)
-    assert value(found, "slope", "mine", "lesion")["value"] == pytest.approx(0.5 * soft["value"], rel=0.05)
+    assert value(found, "dose factor: noise", "shrunk@fbp:soft", "patient")[
+        "value"
+    ] == pytest.approx(4.0, rel=0.02)
+    assert value(found, "slope", "mine", "lesion")["value"] == pytest.approx(
+        0.5 * soft["value"], rel=0.05
+    )
 
 
 def test_a_second_call_computes_nothing_again(task, folder, found):
@@ -134,7 +157,9 @@ def test_a_second_call_computes_nothing_again(task, folder, found):
         raise AssertionError("this piece was finished")
 
     again = evaluate(task, ["fbp:soft", Method("mine", never)], n=16, folder=folder)
-    assert value(again, "error", "mine", "near the bodies") == value(found, "error", "mine", "near the bodies")
+    assert value(again, "error", "mine", "near the bodies") == value(
+        found, "error", "mine", "near the bodies"
+    )
 
 
 @pytest.mark.extended
@@ -163,7 +188,8 @@ def test_invented_contrast_is_what_both_halves_of_the_draws_show():
     nothing = figures(invented=noise, n=24).invented().estimate()
     assert nothing.low < 0.0 < nothing.high
     assert abs(nothing.value) < 10.0
-    # A dark spot in one voxel of a hundred; its sign is that of what is there, so it does not cancel.
+    # A dark spot in one voxel of a hundred; its sign is that of what is there, so it does not
+    # cancel.
     spot = noise - 80.0 * (np.arange(1500) < 15)
     found = figures(invented=spot, n=24).invented().estimate()
     assert found.low < 80.0 < found.high
@@ -192,7 +218,8 @@ def test_only_what_lies_away_from_edges_is_read_as_nothing(task, found):
     assert (shares[task.quiet.numpy()] > 1.0 - 1e-6).all()
     away = ndimage.distance_transform_edt(shares > 0.999, sampling=task.grid.spacing)
     assert away[task.quiet.numpy()].min() > 0.6
-    # A constant error is smoothed to itself, however narrow the region is; so is its mean in every shell.
+    # A constant error is smoothed to itself, however narrow the region is; so is its mean in every
+    # shell.
     np.testing.assert_allclose(reader.invented(reader.truth[0] + 5.0), 5.0, rtol=1e-5)
     np.testing.assert_allclose(reader.shells(reader.truth[0] + 5.0), 5.0, rtol=1e-5)
     assert len(reader.shells(reader.truth[0])) >= 3
@@ -203,7 +230,12 @@ def test_only_what_lies_away_from_edges_is_read_as_nothing(task, found):
 def test_the_report_names_who_shows_less_and_does_not_say_so(found):
     slope = value(found, "slope", "shrunk@fbp:soft", "lesion")
     for share, named in ((0.25, True), (1.0, False)):
-        said = {**slope, "figure": "share with a warning", "where": "with the signal", "value": share}
+        said = {
+            **slope,
+            "figure": "share with a warning",
+            "where": "with the signal",
+            "value": share,
+        }
         text = text_of(replace(found, records=[*found.records, said]))
         assert ("without always saying so: shrunk@fbp:soft (slope" in text) is named
 
@@ -235,7 +267,7 @@ def test_report_and_tidy_table(found, tmp_path):
         (lambda d: "volume", "str"),
         (lambda d: Volume(d.fbp("soft"), VolumeGrid(d.grid.shape, 0.4)), "asked was"),
     ],
-)  # fmt: skip
+)
 def test_what_a_method_gives_is_checked(task, folder, run, expected_text):
     with pytest.raises((ValueError, TypeError), match=expected_text):
         evaluate(task, Method(expected_text, run, kernels=("soft",)), n=8, folder=folder)
@@ -269,7 +301,8 @@ def test_bad_tasks_are_named(tmp_path, folder, changes, expected_text):
 
 
 def test_names_that_are_paths_stay_within(task, tmp_path):
-    """A file's name makes a task's, whatever it is; a method's never leaves the folder of the task."""
+    """A file's name makes a task's, whatever it is; a method's never leaves the folder of the
+    task."""
     path = tmp_path / ".my task (2).yaml"
     path.write_text(INSERT, encoding="utf-8")
     assert read_task(path).name == "my_task__2_"
@@ -299,12 +332,17 @@ def test_pieces_of_another_seed_method_or_exposure_are_not_taken(task, tmp_path)
 @pytest.mark.parametrize(
     ("spec", "expected_text"),
     [
-        ("fbp:hard", "kernel"), ("mbir:sharp=1", "option of mbir"), ("mbir:prior=tw", "prior of mbir"),
+        ("fbp:hard", "kernel"),
+        ("mbir:sharp=1", "option of mbir"),
+        ("mbir:prior=tw", "prior of mbir"),
         ("nothing", "unknown method"),
-        ("bilateral@pwls", "needs FBP"), ("no.such.module:run", "cannot load"), ("files:nowhere", "no folder"),
-        ("json:loads@nowhere", "unknown method"), (3, "must be a name"),
+        ("bilateral@pwls", "needs FBP"),
+        ("no.such.module:run", "cannot load"),
+        ("files:nowhere", "no folder"),
+        ("json:loads@nowhere", "unknown method"),
+        (3, "must be a name"),
     ],
-)  # fmt: skip
+)
 def test_bad_methods_are_named(spec, expected_text):
     with pytest.raises((ValueError, TypeError, FileNotFoundError), match=expected_text):
         method_of(spec)
@@ -323,9 +361,14 @@ def test_volumes_of_another_program(here, cli, found):
     command = "evaluate --task insert.yaml --method files:volumes --n 8 --no-progress"
     assert "files:volumes" in cli(f"{command} --out o")
     report = json.loads((here / "o" / "report.json").read_text(encoding="utf-8"))
-    (slope,) = [r for r in report["records"] if (r["figure"], r["method"], r["where"]) == (
-        "slope", "files:volumes", "lesion")]  # fmt: skip
-    assert slope["value"] == pytest.approx(value(found, "slope", "fbp:soft", "lesion")["value"], abs=0.01)
+    (slope,) = [
+        r
+        for r in report["records"]
+        if (r["figure"], r["method"], r["where"]) == ("slope", "files:volumes", "lesion")
+    ]
+    assert slope["value"] == pytest.approx(
+        value(found, "slope", "fbp:soft", "lesion")["value"], abs=0.01
+    )
     # A DICOM folder in place of a file, the scan's own name, and summaries beside.
     first = here / "volumes" / "insert" / "20s_000_present_fbp.nii.gz"
     volume = Volume.load(first)
@@ -356,7 +399,8 @@ def test_a_denoiser_of_deepinv(slices):
 
 
 def test_the_weights_in_a_denoiser_count_for_what_is_kept_of_it():
-    """The same function with other weights is another method; with equal ones it is the same in every process."""
+    """The same function with other weights is another method; with equal ones it is the same in
+    every process."""
     layers = [torch.nn.Conv3d(1, 1, 3, padding=1) for _ in range(2)]
     twin = torch.nn.Conv3d(1, 1, 3, padding=1)
     twin.load_state_dict(layers[0].state_dict())
@@ -369,16 +413,23 @@ def test_the_weights_in_a_denoiser_count_for_what_is_kept_of_it():
 
 def test_rivals_come_with_their_tuned_settings():
     assert tuned("bilateral", "detail", 2.0) == {"edge": 2.0, "reach": 2.5, "sigma": 1.4}
-    assert tuned("bilateral", "detail", 0.3) == tuned("bilateral", "detail", 0.35) != tuned("bilateral", "detail", 2.0)
+    assert (
+        tuned("bilateral", "detail", 0.3)
+        == tuned("bilateral", "detail", 0.35)
+        != tuned("bilateral", "detail", 2.0)
+    )
     assert tuned("bilateral", "bone", 2.0) == {}
 
 
 def test_commands(here, cli):
-    """Ready tasks are listed and printed; a user's task and denoiser from the folder where the command runs."""
+    """Ready tasks are listed and printed; a user's task and denoiser from the folder where the
+    command runs."""
     assert {line.split()[0] for line in cli("show-task").splitlines()} == set(TASKS)
     assert yaml.safe_load(cli("show-task rod"))["signal"] == "rod"
     (here / "insert.yaml").write_text(INSERT, encoding="utf-8")
-    (here / "my_own_filter.py").write_text("def half(volume):\n    return volume / 2\n", encoding="utf-8")
+    (here / "my_own_filter.py").write_text(
+        "def half(volume):\n    return volume / 2\n", encoding="utf-8"
+    )
     command = "evaluate --task insert.yaml --denoiser my_own_filter:half@fbp:soft --n 8"
     out = cli(f"{command} --out o --no-progress")
     assert "my_own_filter:half@fbp:soft" in out
@@ -397,7 +448,8 @@ def test_commands(here, cli):
 
 
 def test_pwls_is_that_of_a_user(task, folder):
-    """What is measured is what recon.reconstruct gives for the same scan, with the signal and without."""
+    """What is measured is what recon.reconstruct gives for the same scan, with the signal and
+    without."""
     from recon import reconstruct
 
     for draw in Draws(task, Store(folder / task.name)).draw(20.0, 3):
@@ -410,7 +462,10 @@ def test_two_measured_scans(task, folder):
     present, _ = task.scans(Store(folder / task.name))
     scans = [present.with_noise(200.0, k) for k in range(2)]
     names = ["fbp:soft", "gaussian@fbp:ram-lak"]
-    for rows in (evaluate_scans(scans, task.grid, names), evaluate_scans(scans, task.grid, names, n=2, seed=1)):
+    for rows in (
+        evaluate_scans(scans, task.grid, names),
+        evaluate_scans(scans, task.grid, names, n=2, seed=1),
+    ):
         soft, blurred = rows
         assert blurred["dose_factor"] == pytest.approx(1.0, abs=0.1)
         assert blurred["low"] < 1.02
@@ -424,16 +479,22 @@ def test_two_measured_scans(task, folder):
 
 
 def test_volumes_in_two_folders(here, cli):
-    """Of other programs: noise at equal resolution, a row a method. A blur saves nothing, in no direction; half of its
-    noise is four times the dose."""
-    generator, grid = torch.Generator().manual_seed(0), VolumeGrid((4, 64, 64), (1.0, 0.5, 0.5), (3.7, -30.38, 29.63))
+    """Of other programs: noise at equal resolution, a row a method. A blur saves nothing, in no
+    direction; half of its noise is four times the dose."""
+    generator, grid = (
+        torch.Generator().manual_seed(0),
+        VolumeGrid((4, 64, 64), (1.0, 0.5, 0.5), (3.7, -30.38, 29.63)),
+    )
     object_ = torch.zeros(grid.shape)
     object_[:, 20:44, 20:44] = 100.0
     pairs = {"fbp": [], "mine.v2": [], "half": []}
     for folder in ("one", "two"):
         (here / folder).mkdir()
         plain = object_ + torch.randn(grid.shape, generator=generator) * 10
-        soft, clean = (torch.from_numpy(ndimage.gaussian_filter(v.numpy(), [0.6, 1.5, 1.5])) for v in (plain, object_))
+        soft, clean = (
+            torch.from_numpy(ndimage.gaussian_filter(v.numpy(), [0.6, 1.5, 1.5]))
+            for v in (plain, object_)
+        )
         for name, data in (("fbp", plain), ("mine.v2", soft), ("half", (clean + soft) / 2)):
             Volume(data, grid).save(here / folder / f"{name}.nii.gz")
             (here / folder / f"{name}.nii.gz.json").write_text("{}", encoding="utf-8")
@@ -450,18 +511,27 @@ def test_volumes_in_two_folders(here, cli):
     for text in (said, page):
         assert "no smaller than the voxels, 0.5 mm in the plane" in text.replace("&#39;", "'")
     assert "along z" in page
-    (here / "one" / "fbp.nii.gz.json").write_text(json.dumps({"cells_mm": [0.3, 0.2, 0.2]}), encoding="utf-8")
-    assert "not to be trusted: the voxels of 1 × 0.5 × 0.5 mm" in cli("evaluate --volumes one two --out coarse")
+    (here / "one" / "fbp.nii.gz.json").write_text(
+        json.dumps({"cells_mm": [0.3, 0.2, 0.2]}), encoding="utf-8"
+    )
+    assert "not to be trusted: the voxels of 1 × 0.5 × 0.5 mm" in cli(
+        "evaluate --volumes one two --out coarse"
+    )
     cli("evaluate --volumes one two --region :,4:60,4:60 --out part")
     part = json.loads((here / "part" / "report.json").read_text(encoding="utf-8"))["records"]
     assert part[0]["noise"] != report["records"][0]["noise"]
-    Volume(torch.zeros(grid.shape).index_put([torch.tensor(1)], torch.tensor(1.0)), grid).save(here / "mask.nii.gz")
+    Volume(torch.zeros(grid.shape).index_put([torch.tensor(1)], torch.tensor(1.0)), grid).save(
+        here / "mask.nii.gz"
+    )
     cli("evaluate --volumes one two --region mask.nii.gz --out masked")
     for options, expected in (
-        ("--reference other", "hold fbp, half, mine"), ("--n 9", "--n is of --scans"), ("--task rod", "simulated"),
-        ("--region 9:,:,:", "0 voxels"), ("--region nowhere", "neither a file nor ranges"),
+        ("--reference other", "hold fbp, half, mine"),
+        ("--n 9", "--n is of --scans"),
+        ("--task rod", "simulated"),
+        ("--region 9:,:,:", "0 voxels"),
+        ("--region nowhere", "neither a file nor ranges"),
         ("--method pwls", "--scans"),
-    ):  # fmt: skip
+    ):
         assert expected in cli(f"evaluate --volumes one two {options} --out m", 2)
     assert not (here / "m").exists()
     assert "no such file: no" in cli("evaluate --volumes one no", 2)
@@ -476,7 +546,8 @@ def test_volumes_in_two_folders(here, cli):
 
 @pytest.fixture(scope="module")
 def voxel_task(tmp_path_factory):
-    """The insert of :data:`INSERT` again, as a user would have segmented it: on voxels of 0.1 mm."""
+    """The insert of :data:`INSERT` again, as a user would have segmented it: on voxels of 0.1
+    mm."""
     folder = tmp_path_factory.mktemp("voxels")
     at = (np.arange(70) - 34.5) * 0.1
     z, y, x = np.meshgrid(at, at, at, indexing="ij")
@@ -496,8 +567,13 @@ def voxel_task(tmp_path_factory):
 
 @pytest.mark.extended
 def test_a_segmented_lesion_is_a_task(voxel_task, task, folder, tmp_path):
-    """The same figures as the analytic scene, whose insert reads so many HU, within the staircase of the voxels."""
-    mine, store, there = read_task(voxel_task), Store(tmp_path / "pieces"), Store(tmp_path / "analytic")
+    """The same figures as the analytic scene, whose insert reads so many HU, within the
+    staircase of the voxels."""
+    mine, store, there = (
+        read_task(voxel_task),
+        Store(tmp_path / "pieces"),
+        Store(tmp_path / "analytic"),
+    )
     facts, known = mine.facts(store), task.facts(there)
     assert facts.tissues == ("signal", "rim", "patient")
     assert facts.values_hu[2] == pytest.approx(0.0, abs=1.0)
@@ -510,7 +586,9 @@ def test_a_segmented_lesion_is_a_task(voxel_task, task, folder, tmp_path):
     # A column beside it would be 0.23; the staircase of the labels makes the sphere 1.3 % larger.
     assert float((change - exact).norm() / exact.norm()) < 0.08
     assert float(change.sum() / exact.sum()) == pytest.approx(1.0, abs=0.04)
-    assert float(mine.shares["signal"].sum()) * 0.4**3 == pytest.approx(float((mine.labels == 7).sum()) * 0.1**3)
+    assert float(mine.shares["signal"].sum()) * 0.4**3 == pytest.approx(
+        float((mine.labels == 7).sum()) * 0.1**3
+    )
     truth, without = mine.truth(facts)
     assert float(truth.max()) == pytest.approx(52.0)
     assert float(without.abs().max()) < 1.0
@@ -524,7 +602,10 @@ def test_a_segmented_lesion_is_a_task(voxel_task, task, folder, tmp_path):
     ("change", "said"),
     [
         ({"voxels": {"file": "labels.nii.gz"}}, "takes file"),
-        ({"voxels": {"file": "labels.nii.gz", "tissues": {"insert": {"label": 7}}}}, "needs label and hu"),
+        (
+            {"voxels": {"file": "labels.nii.gz", "tissues": {"insert": {"label": 7}}}},
+            "needs label and hu",
+        ),
         (
             {"voxels": {"file": "labels.nii.gz", "tissues": {"insert": {"label": 9, "hu": 1}}}},
             "no voxel has the label 9",

@@ -1,4 +1,5 @@
-"""Jobs in other processes and on a cluster: the same figures, nothing lost, and what is wrong is said."""
+"""Jobs in other processes and on a cluster: the same figures, nothing lost, and what is wrong is
+said."""
 
 import contextlib
 import doctest
@@ -20,7 +21,18 @@ import psutil
 import pytest
 import torch
 from fresh_python import run_python
-from some_jobs import compiles, dies, found_in, full, holds, kills, noted, refuses, set_version, waits
+from some_jobs import (
+    compiles,
+    dies,
+    found_in,
+    full,
+    holds,
+    kills,
+    noted,
+    refuses,
+    set_version,
+    waits,
+)
 from some_jobs import threads as threads_of
 from tiny_studies import INSERT, TINY
 
@@ -61,8 +73,8 @@ def processes():
 def cluster():
     """Of two machines: addresses of this one that look like two.
 
-    On a busy machine a killed worker takes longer to come back than Dask's test cluster waits by default (15 s), which
-    then gives it up for good: a job that waits for it would wait for ever.
+    On a busy machine a killed worker takes longer to come back than Dask's test cluster waits by
+    default (15 s), which then gives it up for good: a job that waits for it would wait for ever.
     """
     distributed, dask = pytest.importorskip("distributed"), pytest.importorskip("dask")
     patient = {
@@ -70,8 +82,14 @@ def cluster():
         "distributed.comm.timeouts.connect": "300s",
         "distributed.scheduler.allowed-failures": 1,  # fewer workers to start again
     }
-    nodes = {k: {"cls": distributed.Nanny, "options": {"host": f"127.0.0.{k}", "nthreads": 1}} for k in (1, 2)}
-    scheduler = {"cls": distributed.Scheduler, "options": {"host": "127.0.0.1", "dashboard_address": ":0"}}
+    nodes = {
+        k: {"cls": distributed.Nanny, "options": {"host": f"127.0.0.{k}", "nthreads": 1}}
+        for k in (1, 2)
+    }
+    scheduler = {
+        "cls": distributed.Scheduler,
+        "options": {"host": "127.0.0.1", "dashboard_address": ":0"},
+    }
     with dask.config.set(patient), distributed.SpecCluster(nodes, scheduler) as workers:
         executor = Cluster(workers.scheduler_address)
         yield executor
@@ -98,7 +116,9 @@ def names(folder):
 
 def test_processes_give_the_same_figures(task, serial, processes, tmp_path, monkeypatch):
     own = []
-    monkeypatch.setattr("recon.evaluate.measure.volume_of", lambda method, draw: own.append(method.name))
+    monkeypatch.setattr(
+        "recon.evaluate.measure.volume_of", lambda method, draw: own.append(method.name)
+    )
     found = evaluate(task, METHODS, n=8, folder=tmp_path, executor=processes)
     assert own == []  # nothing was left for this process
     assert figures(found) == serial
@@ -112,7 +132,9 @@ def test_processes_give_the_same_figures(task, serial, processes, tmp_path, monk
 @pytest.mark.parametrize("shared", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_a_cluster_gives_the_same_figures(task, serial, cluster, tmp_path, monkeypatch, shared):
     if not shared:  # a marker that no worker sees: they compute on a disk of their own
-        monkeypatch.setattr(execute, "marker", lambda folder: contextlib.nullcontext(folder / "not" / f"{shared}"))
+        monkeypatch.setattr(
+            execute, "marker", lambda folder: contextlib.nullcontext(folder / "not" / f"{shared}")
+        )
     monkeypatch.setattr("recon.evaluate.measure.volume_of", pytest.fail)
     assert figures(evaluate(task, METHODS, n=8, folder=tmp_path, executor=cluster)) == serial
     assert bool(list(tmp_path.rglob("*.h5"))) is shared  # scans stay where they were made
@@ -121,17 +143,27 @@ def test_a_cluster_gives_the_same_figures(task, serial, cluster, tmp_path, monke
 @pytest.mark.extended
 @pytest.mark.parametrize(
     "name",
-    ["detector", *(pytest.param(n, marks=pytest.mark.slow) for n in ("bowtie", "motion", "resolution", "spectral",
-                                                                     "hardcases", "compare"))],
-)  # fmt: skip
+    [
+        "detector",
+        *(
+            pytest.param(n, marks=pytest.mark.slow)
+            for n in ("bowtie", "motion", "resolution", "spectral", "hardcases", "compare")
+        ),
+    ],
+)
 def test_a_study_gives_the_same_report(name, processes, tmp_path):
-    settings = {**TINY[name], **({"cases": ("dead-column", "metal")} if name == "hardcases" else {})}
+    settings = {
+        **TINY[name],
+        **({"cases": ("dead-column", "metal")} if name == "hardcases" else {}),
+    }
     run_tiny_with(name, settings, tmp_path / "here")
     processes.log = tmp_path / "run.log"
     with execute.using(processes):
         run_tiny_with(name, settings, tmp_path / "there")
     assert "done     " in processes.log.read_text()
-    here, there = (json.loads((tmp_path / x / "report.json").read_text()) for x in ("here", "there"))
+    here, there = (
+        json.loads((tmp_path / x / "report.json").read_text()) for x in ("here", "there")
+    )
     assert list(differences(here, there)) == []
     assert not [p for p in (tmp_path / "there").rglob(".*")]
 
@@ -163,7 +195,12 @@ def test_many_scans_go_on_after_an_interruption(tmp_path, monkeypatch, capsys):
     g = ConeBeam(full_turn(24), 300.0, 500.0, 24, 4, 1.0)
     for k in range(3):
         Scan.from_counts(torch.full(g.shape, 900.0 + k), g, air=1000.0).save(tmp_path / f"s{k}.h5")
-    command = ["reconstruct", *(str(tmp_path / f"s{k}.h5") for k in range(3)), "--out", str(tmp_path / "out")]
+    command = [
+        "reconstruct",
+        *(str(tmp_path / f"s{k}.h5") for k in range(3)),
+        "--out",
+        str(tmp_path / "out"),
+    ]
     save, saved = Volume.save, []
 
     def interrupted(volume, path):
@@ -179,7 +216,9 @@ def test_many_scans_go_on_after_an_interruption(tmp_path, monkeypatch, capsys):
         raise SystemExit(main(command))
     # One of the two is made again: its scan has changed.
     Scan.from_counts(torch.full(g.shape, 800.0), g, air=1000.0).save(tmp_path / "s1.h5")
-    monkeypatch.setattr(Volume, "save", lambda volume, path: saved.append(Path(path).name) or save(volume, path))
+    monkeypatch.setattr(
+        Volume, "save", lambda volume, path: saved.append(Path(path).name) or save(volume, path)
+    )
     capsys.readouterr()
     assert main(command) == 0
     assert saved == [f"s{k}_fbp.nii.gz" for k in (0, 1, 1, 2)]
@@ -198,7 +237,9 @@ def test_slabs_of_a_volume_are_jobs(where, tmp_path, monkeypatch, request):
         here = reconstruct_to(scan, grid, tmp_path / "here.nii")
     executor = request.getfixturevalue(where)
     if where == "cluster":  # on disks of their own
-        monkeypatch.setattr(execute, "marker", lambda folder: contextlib.nullcontext(folder / "not" / "there"))
+        monkeypatch.setattr(
+            execute, "marker", lambda folder: contextlib.nullcontext(folder / "not" / "there")
+        )
     executor.log = tmp_path / "run.log"
 
     def interrupted(self, values):
@@ -234,12 +275,20 @@ def test_a_lambda_is_computed_here(task, processes, tmp_path, caplog):
 
 
 @pytest.mark.extended
-def test_a_job_whose_process_dies_is_repeated_and_left_out_after_three(processes, tmp_path, caplog, capfd):
-    jobs = [Job("once", dies, ("once", 1)), Job("always", dies, ("always", 9)),
-            Job("needs it", noted, ("n", 1), after=("always",)),
-            *(Job(f"other {k}", noted, (f"o{k}", k)) for k in range(8))]  # fmt: skip
+def test_a_job_whose_process_dies_is_repeated_and_left_out_after_three(
+    processes, tmp_path, caplog, capfd
+):
+    jobs = [
+        Job("once", dies, ("once", 1)),
+        Job("always", dies, ("always", 9)),
+        Job("needs it", noted, ("n", 1), after=("always",)),
+        *(Job(f"other {k}", noted, (f"o{k}", k)) for k in range(8)),
+    ]
     processes.log = tmp_path / "run.log"
-    with pytest.raises(LeftOut, match=r"2 of 11 jobs are missing: always \(its process died\); needs it \(needs alw"):
+    with pytest.raises(
+        LeftOut,
+        match=r"2 of 11 jobs are missing: always \(its process died\); needs it \(needs alw",
+    ):
         run(jobs, tmp_path, processes)
     assert (tmp_path / "once.txt").exists()
     assert len(list(tmp_path.glob("o*.txt"))) == 9
@@ -255,9 +304,13 @@ def test_a_job_whose_process_dies_is_repeated_and_left_out_after_three(processes
 @pytest.mark.slow
 @pytest.mark.cluster
 def test_a_job_that_kills_workers_of_a_cluster_is_left_out_alone(cluster, tmp_path):
-    """Dask counts every job that a dead worker had been given: the others must not be among them."""
-    jobs = [Job("once", dies, ("once", 1)), Job("always", dies, ("always", 99)),
-            *(Job(f"other {k}", noted, (f"o{k}", k)) for k in range(8))]  # fmt: skip
+    """Dask counts every job that a dead worker had been given: the others must not be among
+    them."""
+    jobs = [
+        Job("once", dies, ("once", 1)),
+        Job("always", dies, ("always", 99)),
+        *(Job(f"other {k}", noted, (f"o{k}", k)) for k in range(8)),
+    ]
     with pytest.raises(LeftOut, match=r"1 of 10 jobs are missing: always \(KilledWorker"):
         run(jobs, tmp_path, cluster)
     assert len(list(tmp_path.glob("o*.txt"))) == 9
@@ -298,8 +351,12 @@ def test_workers_of_a_machine_compile_a_kernel_once(tmp_path, monkeypatch):
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_a_signal_ends_the_processes_and_takes_back_what_is_half_written(tmp_path):
-    """SIGTERM to the command alone, as ``kill`` sends it; a batch system sends it to its processes, too."""
-    log, jobs = tmp_path / "log", [Job("quick", noted, ("q", 1)), Job("holds", holds, (60.0,), after=("quick",))]
+    """SIGTERM to the command alone, as ``kill`` sends it; a batch system sends it to its
+    processes, too."""
+    log, jobs = (
+        tmp_path / "log",
+        [Job("quick", noted, ("q", 1)), Job("holds", holds, (60.0,), after=("quick",))],
+    )
     log.mkdir()
 
     def signalled():
@@ -321,7 +378,9 @@ def test_a_signal_ends_the_processes_and_takes_back_what_is_half_written(tmp_pat
     with pytest.raises(ProcessLookupError):
         os.kill(int((tmp_path / "begun").read_text()), 0)
     assert {p.name for p in tmp_path.iterdir()} == {"q.txt", "begun", "log"}
-    assert "ended    ended by SIGTERM: 1 of 2 jobs are done, and kept" in (log / "run.log").read_text()
+    assert (
+        "ended    ended by SIGTERM: 1 of 2 jobs are done, and kept" in (log / "run.log").read_text()
+    )
 
 
 def wait_until(condition, seconds=120.0):
@@ -336,11 +395,30 @@ def wait_until(condition, seconds=120.0):
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_a_signal_ends_evaluate(tmp_path, name):
     number = getattr(signal, name)
-    command = [sys.executable, "-c", "import sys; from recon.cli import main; sys.exit(main())", "evaluate", "--task",
-               "nodule", "--method", "fbp:soft", "--n", "400", "--workers", "1", "--out", "out"]  # fmt: skip
+    command = [
+        sys.executable,
+        "-c",
+        "import sys; from recon.cli import main; sys.exit(main())",
+        "evaluate",
+        "--task",
+        "nodule",
+        "--method",
+        "fbp:soft",
+        "--n",
+        "400",
+        "--workers",
+        "1",
+        "--out",
+        "out",
+    ]
     path = os.pathsep.join(p for p in sys.path if p)
-    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True,
-                          env={**os.environ, "PYTHONPATH": path}) as process:  # fmt: skip
+    with subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": path},
+    ) as process:
         wait_until(lambda: list(tmp_path.glob("out/pieces/**/*.h5")), 300.0)
         children = psutil.Process(process.pid).children(recursive=True)
         process.send_signal(number)
@@ -354,7 +432,8 @@ def test_a_signal_ends_evaluate(tmp_path, name):
 
 
 def test_what_lies_in_the_current_folder_hides_no_module(tmp_path, monkeypatch):
-    """Neither in a process when it starts, nor later; a module of the user's own is found there, after all others."""
+    """Neither in a process when it starts, nor later; a module of the user's own is found there,
+    after all others."""
     for name in ("selectors", "spekpy", "mine"):
         (tmp_path / f"{name}.py").write_text("")
     monkeypatch.chdir(tmp_path)
@@ -374,24 +453,32 @@ def test_what_lies_in_the_current_folder_hides_no_module(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("method", "is_of_a_module"),
     [
-        ("fbp:soft", False), ("pwls", False), ("mbir:tissues", False), ("files:a/b", False), ("tv@fbp:soft", False),
-        ("mylab.nets:reconstruct", True), ("mylab.nets:denoise@fbp:detail", True),
+        ("fbp:soft", False),
+        ("pwls", False),
+        ("mbir:tissues", False),
+        ("files:a/b", False),
+        ("tv@fbp:soft", False),
+        ("mylab.nets:reconstruct", True),
+        ("mylab.nets:denoise@fbp:detail", True),
     ],
-)  # fmt: skip
+)
 def test_modules_are_looked_for_in_the_current_folder_only_for_a_method_of_one(
     method, is_of_a_module, here, monkeypatch
 ):
     monkeypatch.setattr(sys, "path", [p for p in sys.path if p not in ("", str(here))])
     before, seen = list(sys.path), []
     Path("a/b").mkdir(parents=True)
-    monkeypatch.setattr("recon.evaluate.experiment.evaluate", lambda *_, **__: seen.append(list(sys.path)))
+    monkeypatch.setattr(
+        "recon.evaluate.experiment.evaluate", lambda *_, **__: seen.append(list(sys.path))
+    )
     assert main(["evaluate", "--task", "nodule", "--method", method, "--out", "out"]) == 0
     assert seen == [[*before, os.getcwd()] if is_of_a_module else before]
 
 
 @pytest.mark.cluster
 def test_a_job_that_is_done_while_the_scheduler_answers_is_no_loss(cluster, tmp_path, monkeypatch):
-    """Keys of jobs that are lost, asked for, and forgotten when the answer comes: the scheduler is not gone."""
+    """Keys of jobs that are lost, asked for, and forgotten when the answer comes: the scheduler
+    is not gone."""
     asked = []
 
     class Client:
@@ -443,9 +530,14 @@ def test_a_full_disk_of_one_machine_is_named_and_the_rest_goes_on(cluster, tmp_p
     try:
         assert len(run(jobs, tmp_path, cluster)) == 6
         assert list(cluster.avoid) == ["127.0.0.1"]
-        assert re.search(r"the worker tcp://127\.0\.0\.1:\d+ cannot write: .*No space left on device", caplog.text)
+        assert re.search(
+            r"the worker tcp://127\.0\.0\.1:\d+ cannot write: .*No space left on device",
+            caplog.text,
+        )
         more = [Job(f"{k}", full, (f"f{k}", "127.0.0.2")) for k in range(6)]
-        with pytest.raises(LeftOut, match=r"6 of 6 jobs are missing.*no worker is left: .*No space left on device"):
+        with pytest.raises(
+            LeftOut, match=r"6 of 6 jobs are missing.*no worker is left: .*No space left on device"
+        ):
             run(more, tmp_path, cluster)
     finally:
         cluster.avoid.clear()
@@ -500,18 +592,34 @@ def test_an_unreachable_scheduler_is_told_in_one_sentence(here, cli):
 def test_a_scheduler_that_dies_is_told_in_one_sentence_and_what_is_done_is_kept(tmp_path):
     pytest.importorskip("distributed")
     file = tmp_path / "scheduler.json"
-    words = ("scheduler --host 127.0.0.1 --port 0", "worker --nthreads 1 --no-nanny --death-timeout 60")
+    words = (
+        "scheduler --host 127.0.0.1 --port 0",
+        "worker --nthreads 1 --no-nanny --death-timeout 60",
+    )
     started = [
         subprocess.Popen(
-            [sys.executable, "-m", "dask", *text.split(), "--no-dashboard", "--scheduler-file", file],
-            cwd=tmp_path, stderr=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+            [
+                sys.executable,
+                "-m",
+                "dask",
+                *text.split(),
+                "--no-dashboard",
+                "--scheduler-file",
+                file,
+            ],
+            cwd=tmp_path,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         )
         for text in words
-    ]  # fmt: skip
+    ]
     try:
         while not file.exists():
             time.sleep(0.05)
-        jobs = [Job("first", noted, ("first", 1)), Job("second", kills, (started[0].pid,), after=("first",))]
+        jobs = [
+            Job("first", noted, ("first", 1)),
+            Job("second", kills, (started[0].pid,), after=("first",)),
+        ]
         with pytest.raises(ConnectionError, match="is gone: what is done is kept"):
             run(jobs, tmp_path, Cluster(str(file)))
     finally:
@@ -553,21 +661,36 @@ run([Job("x", noted, ("x", 1))], Path({folder!r}), cluster)
 @pytest.mark.extended
 @pytest.mark.cluster
 def test_the_recipe_of_srun(tmp_path):
-    """The page's script as it stands, with an ``srun`` that starts one process of each step here."""
+    """The page's script as it stands, with an ``srun`` that starts one process of each step
+    here."""
     pytest.importorskip("distributed")
     (script,) = re.findall(r"```bash\n(#!/bin/bash.*?)```", PAGE.read_text(encoding="utf-8"), re.S)
     path = [p for p in sys.path if p]
-    texts = {"srun": SRUN, "torchpcct": COMMAND.format(python=sys.executable, path=path, folder=str(tmp_path)),
-             "job": script.replace("/shared/$USER", str(tmp_path))}  # fmt: skip
+    texts = {
+        "srun": SRUN,
+        "torchpcct": COMMAND.format(python=sys.executable, path=path, folder=str(tmp_path)),
+        "job": script.replace("/shared/$USER", str(tmp_path)),
+    }
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
         (tmp_path / name).chmod(0o755)
     environment = {
-        **os.environ, "PATH": os.pathsep.join([str(tmp_path), str(Path(sys.executable).parent), os.environ["PATH"]]),
-        "SLURM_JOB_ID": "17", "CALLS": str(tmp_path / "calls"), "PYTHONPATH": os.pathsep.join(path),
-    }  # fmt: skip
-    job = subprocess.Popen([tmp_path / "job"], cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True,
-                           start_new_session=True)  # fmt: skip
+        **os.environ,
+        "PATH": os.pathsep.join(
+            [str(tmp_path), str(Path(sys.executable).parent), os.environ["PATH"]]
+        ),
+        "SLURM_JOB_ID": "17",
+        "CALLS": str(tmp_path / "calls"),
+        "PYTHONPATH": os.pathsep.join(path),
+    }
+    job = subprocess.Popen(
+        [tmp_path / "job"],
+        cwd=tmp_path,
+        env=environment,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
     try:
         assert job.wait(600) == 0
     finally:
@@ -598,7 +721,7 @@ known = {name for name, _ in seen}
 def note(frame, event, what):
     name = frame.f_globals.get("__name__", "")
     if event == "call" and name not in known and name.startswith(("torchpcct", "recon", "train")):
-        while frame is not None and frame.f_code.co_name != "<module>" or frame.f_globals["__name__"] == "__main__":
+        while frame.f_code.co_name != "<module>" or frame.f_globals["__name__"] == "__main__":
             frame = frame.f_back
             if frame is None:  # not while modules load
                 called.add(name)
@@ -616,8 +739,8 @@ print(*called)
 
 @pytest.mark.extended
 def test_a_digest_covers_all_that_a_piece_runs(task, tmp_path):
-    """Every function that is called while a piece is computed stands in a module that the digest has read, and the
-    digest reads neither studies nor the command line."""
+    """Every function that is called while a piece is computed stands in a module that the digest
+    has read, and the digest reads neither studies nor the command line."""
     (tmp_path / "given").write_bytes(pickle.dumps((task, [method_of(m) for m in METHODS])))
     called = run_python(CALLED, tmp_path / "given", tmp_path / "store").stdout.split()
     packages = {"recon", "torchpcct"}  # where lazy names are looked up

@@ -14,15 +14,19 @@ from recon.mbir.mbir import Mbir
 from recon.mbir.network import NetworkConfig
 from recon.mbir.unrolled import Unrolled
 
-SHAPE, DOSE = (6, 8, 8), 0.5
+SHAPE = (6, 8, 8)
+DOSE = 0.5
 
 
 @pytest.fixture(scope="module")
 def inset():
-    """A small inset in double precision, with the attributes of an InsetProblem that methods ask for."""
+    """A small inset in double precision, with the attributes of an InsetProblem that methods ask
+    for."""
     A, w = problem(shape=SHAPE, rows=10, dtype=torch.float64)
     gram = Gram(A, w, nodes=1)
-    p = SimpleNamespace(gram=gram, grid=A.grid, mu_ref=1000 * HU, level=-0.1 * 1000 * HU, projector=A, weights=w)
+    p = SimpleNamespace(
+        gram=gram, grid=A.grid, mu_ref=1000 * HU, level=-0.1 * 1000 * HU, projector=A, weights=w
+    )
     return p, gram.apply(tissue(A.grid).double()) * DOSE
 
 
@@ -58,7 +62,8 @@ def test_of_a_linear_method_is_its_matrix(inset, weights):
 
 
 def test_follows_a_network(inset, weights):
-    """g·b of draws that it was not averaged over is correlated with the method's own means, and of equal size."""
+    """g·b of draws that it was not averaged over is correlated with the method's own means, and
+    of equal size."""
     p, b = inset
     run = method(p)
     g = response(run, p, weights, b, DOSE)
@@ -73,10 +78,17 @@ def test_follows_a_network(inset, weights):
 def test_covariance_is_that_of_projections(inset, weights, monkeypatch):
     """gᵀ AᵀW V W A g by explicit projections."""
     p, _ = inset
-    variance = torch.rand(p.weights.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2)) + 0.5
+    variance = (
+        torch.rand(p.weights.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+        + 0.5
+    )
     clean = SimpleNamespace(window="w", geometry="g", crop=lambda window: "cropped")
-    monkeypatch.setattr("recon.evaluate.response.line_integral_variance", lambda scan, exposure: variance / exposure)
-    inner = SimpleNamespace(weights=p.weights, projector=p.projector, outer="w", geometry="g", window="w")
+    monkeypatch.setattr(
+        "recon.evaluate.response.line_integral_variance", lambda scan, exposure: variance / exposure
+    )
+    inner = SimpleNamespace(
+        weights=p.weights, projector=p.projector, outer="w", geometry="g", window="w"
+    )
     found = statistic_covariance(inner, weights, DOSE, clean)
     rows = [p.projector(w) * p.weights * DOSE for w in weights]
     expected = [[float((a * b * variance / DOSE).sum()) for b in rows] for a in rows]

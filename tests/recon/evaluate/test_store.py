@@ -1,4 +1,5 @@
-"""Pieces of a study: what goes in comes out, kills lose one piece at most, and nothing of another version is used."""
+"""Pieces of a study: what goes in comes out, kills lose one piece at most, and nothing of
+another version is used."""
 
 import io
 import json
@@ -94,19 +95,27 @@ def test_finished_pieces_are_used_again_by_the_same_settings_and_source_only(tmp
 
 def _content(folder):
     return {
-        path.relative_to(folder).as_posix(): None if path.is_dir() else path.read_bytes() for path in folder.rglob("*")
+        path.relative_to(folder).as_posix(): None if path.is_dir() else path.read_bytes()
+        for path in folder.rglob("*")
     }
 
 
 @pytest.mark.parametrize("linked", [False, True])
 def test_only_what_a_study_wrote_is_ever_removed(tmp_path, linked):
-    """Files of the user in ``OUT/pieces``, also of a kept piece's name and kind, also where it is a link."""
+    """Files of the user in ``OUT/pieces``, also of a kept piece's name and kind, also where it
+    is a link."""
     out, pieces = tmp_path / "out", tmp_path / "out" / "pieces"
     out.mkdir()
     if linked:
         (tmp_path / "mine").mkdir()
         pieces.symlink_to(tmp_path / "mine", target_is_directory=True)
-    for name in ("deep/notes.txt", "deep/.part", "empty/nothing/", "other.d/data.npz", "deep/x.npz"):
+    for name in (
+        "deep/notes.txt",
+        "deep/.part",
+        "empty/nothing/",
+        "other.d/data.npz",
+        "deep/x.npz",
+    ):
         path = pieces / name
         (path if name.endswith("/") else path.parent).mkdir(parents=True, exist_ok=True)
         if path.suffix == ".npz":
@@ -128,7 +137,9 @@ def test_only_what_a_study_wrote_is_ever_removed(tmp_path, linked):
     store.keep_scan(scan, store.path("task/present-fedcba9876543210.h5"))
     assert Scan.load(store.path("task/present-fedcba9876543210.h5")).geometry == g
     own = {"a.npz", "deep/deeper/y.npz", "evaluate/task/present-fedcba9876543210.h5"}
-    assert own <= {name.removeprefix("out/pieces/").removeprefix("mine/") for name in _content(tmp_path)}
+    assert own <= {
+        name.removeprefix("out/pieces/").removeprefix("mine/") for name in _content(tmp_path)
+    }
     (pieces / "copy of a.npz").write_bytes((pieces / "a.npz").read_bytes())
     mine = {**mine, **{k: v for k, v in _content(tmp_path).items() if "copy" in k}}
     Pieces.clear(out)
@@ -142,7 +153,9 @@ def test_a_piece_does_not_replace_a_file_of_the_user(tmp_path, caplog):
     store = Store(tmp_path)
     assert [store.piece("x", "key", lambda: 7) for _ in range(2)] == [7, 7]
     Store(tmp_path / "far").piece("x", "key", lambda: 7)
-    execute._keep(tmp_path, {name: (tmp_path / "far/x.npz").read_bytes() for name in ("x.npz", "y.npz")})
+    execute._keep(
+        tmp_path, {name: (tmp_path / "far/x.npz").read_bytes() for name in ("x.npz", "y.npz")}
+    )
     assert (tmp_path / "x.npz").read_bytes() == mine
     assert store.piece("y", "key", lambda: 8) == 7
     assert "x.npz is no piece of a study: it is left as it is" in caplog.text
@@ -158,7 +171,8 @@ def test_one_name_is_one_piece(tmp_path):
 
 
 def test_kills_at_random_moments_lose_one_piece_at_most(tmp_path, monkeypatch):
-    """A study of 12 pieces is killed (SIGKILL) again and again until it gets through; many kills hit a write."""
+    """A study of 12 pieces is killed (SIGKILL) again and again until it gets through; many kills
+    hit a write."""
 
     def slowly(path, savez=np.savez, **arrays):
         savez(whole := io.BytesIO(), **arrays)
@@ -189,7 +203,10 @@ def test_kills_at_random_moments_lose_one_piece_at_most(tmp_path, monkeypatch):
             study()
             os._exit(0)
         end = time.monotonic() + float(rng.uniform(0.0, 0.12)) * (1 + kills / 20)
-        while time.monotonic() < end and os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
+        while (
+            time.monotonic() < end
+            and os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
+        ):
             time.sleep(0.002)
         os.kill(child, signal.SIGKILL)
         if os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0:
@@ -226,9 +243,12 @@ run_tiny(sys.argv[1], Path(sys.argv[3]))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["noise", "motion", "resolution", "hardcases", "detector", "bowtie", "spectral"])
+@pytest.mark.parametrize(
+    "name", ["noise", "motion", "resolution", "hardcases", "detector", "bowtie", "spectral"]
+)
 def test_a_killed_study_goes_on_where_it_was(name, tmp_path, monkeypatch):
-    """Killed at a random piece, again and again: the report is that of a run in one go, and no piece is made twice."""
+    """Killed at a random piece, again and again: the report is that of a run in one go, and no
+    piece is made twice."""
     kills = np.random.default_rng(0).integers(1, 4, 4)
     for after in kills:
         run = run_python(_KILLED, name, after, tmp_path / "killed", check=False)
@@ -240,7 +260,9 @@ def test_a_killed_study_goes_on_where_it_was(name, tmp_path, monkeypatch):
     finished = len([path for path in kept if "evaluate" not in path.parts])
     assert finished >= 1
     made, keep = [], Pieces.__call__
-    monkeypatch.setattr(Pieces, "__call__", lambda self, n, f: keep(self, n, lambda: made.append(n) or f()))
+    monkeypatch.setattr(
+        Pieces, "__call__", lambda self, n, f: keep(self, n, lambda: made.append(n) or f())
+    )
     resumed = run_tiny(name, tmp_path / "killed")
     again = len(made)
     whole = run_tiny(name, tmp_path / "whole")

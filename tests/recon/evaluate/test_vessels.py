@@ -22,7 +22,8 @@ POINTS = 1 << 14
 
 
 def points_of_unit_cube(count):
-    """Golden-ratio sequence of three dimensions (Roberts 2018): nothing in common with what is tested."""
+    """Golden-ratio sequence of three dimensions (Roberts 2018): nothing in common with what is
+    tested."""
     phi = 1.2207440846057596
     return np.mod(0.5 + np.arange(1, count + 1)[:, None] / phi ** np.arange(1, 4), 1.0) - 0.5
 
@@ -32,7 +33,11 @@ def off_by(vessel, grid, values, voxels):
     shares = np.stack(list(vessel.shares(grid).values()))
     np.testing.assert_allclose(shares.sum(0), 1.0, atol=1e-12)
     crossed = np.argwhere(shares.max(0) < 1.0)
-    cube, hu, errors = points_of_unit_cube(POINTS) * grid.spacing[0], np.array([*values.values()]), []
+    cube, hu, errors = (
+        points_of_unit_cube(POINTS) * grid.spacing[0],
+        np.array([*values.values()]),
+        [],
+    )
     for at in np.random.default_rng(3).choice(crossed, voxels, replace=False):
         centre = [grid.axes[a][at[a]] for a in (2, 1, 0)]
         true = np.bincount(vessel.labels(centre + cube), minlength=len(hu)) / POINTS
@@ -75,7 +80,12 @@ def test_shares_of_the_held_out_vessels_are_converged(direction, monkeypatch):
     line, geometry, values = bench._HELD_OUT[direction]
     plaque = Plaque(position=(0.0, 0.0, 0.0), vessel_length=8.0, **geometry)
     grid = VolumeGrid((57, 45, 45), 0.2, (0.0, -30.38, -29.63))
-    assert off_by(Vessel(line, grid.center, plaque=plaque), grid, dict(zip(HU, values, strict=True)), 150) < 0.5
+    assert (
+        off_by(
+            Vessel(line, grid.center, plaque=plaque), grid, dict(zip(HU, values, strict=True)), 150
+        )
+        < 0.5
+    )
 
 
 def test_painting_is_the_mean_of_the_values_and_bending_keeps_volumes():
@@ -96,7 +106,8 @@ def test_label_fractions_of_boxes_and_slivers_are_exact_and_bad_labels_are_named
     grid = VolumeGrid((6, 6, 6), 1.0)
 
     def layers(points):
-        # Outside, then a layer of 0.02 voxels, then the inside: the sliver lies between faces that are found.
+        # Outside, then a layer of 0.02 voxels, then the inside: the sliver lies between faces that
+        # are found.
         return np.where(points[..., 0] < 0.331, -1, np.where(points[..., 0] < 0.351, 0, 1))
 
     shares = label_fractions(layers, 2, grid)

@@ -1,4 +1,5 @@
-"""Measured scans: voxels coarser than the detector's cells credit no kernel, a single slice is a volume, too."""
+"""Measured scans: voxels coarser than the detector's cells credit no kernel, a single slice is a
+volume, too."""
 
 import math
 from dataclasses import replace
@@ -16,27 +17,39 @@ from torchpcct.scan_grid import cells_at_axis
 from torchpcct.vector_geometry import VectorGeometry
 
 MU = 0.02
-CELLS, VIEWS, PHOTONS = 96, 120, 2e5
+CELLS = 96
+VIEWS = 120
+PHOTONS = 2e5
 
 
 @pytest.fixture(scope="module")
 def scans():
     """Two of a disc with many inserts, in one plane; cells of 1 mm."""
-    draw, geometry = np.random.default_rng(3), ParallelBeam(np.arange(VIEWS) * np.pi / VIEWS, CELLS, 1.0)
+    draw, geometry = (
+        np.random.default_rng(3),
+        ParallelBeam(np.arange(VIEWS) * np.pi / VIEWS, CELLS, 1.0),
+    )
     solids = [Solid(CYLINDER, (0.0, 0.0, 0.0), (40.0, 40.0, 1e5), MU)]
     for _ in range(80):
         size, turn = draw.uniform(1.0, 5.0), draw.uniform(0.0, 2.0 * math.pi)
         away = draw.uniform(0.0, 40.0 - size)
-        place, radii = (away * math.cos(turn), away * math.sin(turn), 0.0), (size, size * draw.uniform(0.5, 1.0), 1e5)
-        solids.append(Solid(CYLINDER, place, radii, MU * draw.uniform(-0.5, 0.5), draw.uniform(0.0, 3.0)))
+        place, radii = (
+            (away * math.cos(turn), away * math.sin(turn), 0.0),
+            (size, size * draw.uniform(0.5, 1.0), 1e5),
+        )
+        solids.append(
+            Solid(CYLINDER, place, radii, MU * draw.uniform(-0.5, 0.5), draw.uniform(0.0, 3.0))
+        )
     shone = PHOTONS * transmissions(geometry, solids, subs=(3, 1, 1))
     return [
         Scan.from_counts(
-            np.random.default_rng(k).poisson(shone).astype(np.float64), geometry, air=np.full(CELLS, PHOTONS),
+            np.random.default_rng(k).poisson(shone).astype(np.float64),
+            geometry,
+            air=np.full(CELLS, PHOTONS),
             mu_water=MU,
         )
         for k in range(2)
-    ]  # fmt: skip
+    ]
 
 
 @pytest.mark.parametrize("voxel", [1.0, 1.5, 2.0, 3.0])
@@ -51,15 +64,22 @@ def test_a_softer_kernel_saves_no_dose_on_coarse_voxels(scans, voxel):
         assert row["dose_factor"] == pytest.approx(1.0, abs=0.25), row
         assert bool(row["note"]) == (voxel > 1.0)
     if voxel > 1.0:
-        assert f"voxels of {voxel:g} mm are coarser than the detector's cells, 1 mm at the axis" in rows[0]["note"]
+        assert (
+            f"voxels of {voxel:g} mm are coarser than the detector's cells, 1 mm at the axis"
+            in rows[0]["note"]
+        )
         assert f"on voxels of {voxel / math.ceil(voxel):g} mm and" in rows[0]["note"]
         assert f"Note: {rows[0]['note']}.\n" in measured_text(rows, "HU", "fbp:ram-lak")
 
 
 def test_of_volumes_the_condition_is_stated(scans):
-    """Of files of others nothing is known of the detector; where it is, the factors are sound, or said not to be."""
+    """Of files of others nothing is known of the detector; where it is, the factors are sound,
+    or said not to be."""
     grid = VolumeGrid((28, 28), 3.0)
-    sharp, soft = ([reconstruct(s, grid, "fbp", kernel=kernel) for s in scans] for kernel in ("ram-lak", "soft"))
+    sharp, soft = (
+        [reconstruct(s, grid, "fbp", kernel=kernel) for s in scans]
+        for kernel in ("ram-lak", "soft")
+    )
     cells = sharp[0].report["cells_mm"]
     assert cells == [1.0, 1.0]
     volumes = ({"theirs": [v.data for v in soft]}, [v.data for v in sharp], 3.0)
@@ -78,7 +98,9 @@ def test_of_volumes_the_condition_is_stated(scans):
 def test_views_are_exchanged_with_their_flux(scans):
     """The second scan's tube gave a third less: its views keep their own flux in the other scan."""
     first, second = scans
-    dimmer = replace(second, counts=torch.round(second.counts * 0.67), flux=torch.full((VIEWS,), 0.67).double())
+    dimmer = replace(
+        second, counts=torch.round(second.counts * 0.67), flux=torch.full((VIEWS,), 0.67).double()
+    )
     grid = VolumeGrid((42, 42), 2.0)
     (row,) = evaluate_scans([first, dimmer], grid, "fbp:ram-lak", n=2, seed=1)
     (plain,) = evaluate_scans(scans, grid, "fbp:ram-lak")

@@ -36,11 +36,13 @@ def test_error_on_tissue_and_on_noise(inset):
 
 
 def test_smooth_tissue_is_exact_at_few_views():
-    """The cut-off of lags makes low frequencies of the padded grid indefinite, which is no error on the grid."""
+    """The cut-off of lags makes low frequencies of the padded grid indefinite, which is no error
+    on the grid."""
     A, w = problem(views=180, shape=(24, 46, 46), voxel=0.2, rows=14)
     gram = Gram(A, w, nodes=5)
     assert float(error(gram, A, w, tissue(A.grid))) <= 0.004
-    # Conjugate gradients meet the least eigenvalues first: on the grid the operator is definite still.
+    # Conjugate gradients meet the least eigenvalues first: on the grid the operator is definite
+    # still.
     left = torch.randn(A.domain_shape, generator=torch.Generator().manual_seed(1))
     step = left
     for _ in range(60):
@@ -68,7 +70,8 @@ def test_self_adjoint_and_positive(inset):
 
 @pytest.mark.parametrize("terms", [1, 6])
 def test_spectra_become_definite_whatever_they_are(terms):
-    """Frequencies: sound; position-dependent terms too large; indefinite at the centre; negative throughout."""
+    """Frequencies: sound; position-dependent terms too large; indefinite at the centre; negative
+    throughout."""
     nz, kinds = 6, 4
     spectra = torch.zeros(terms, 2, nz, 1, kinds, dtype=torch.complex64)
     spectra[0, 0, :, 0] = torch.tensor([1.0, 1.0, 0.5, -1.0])
@@ -78,14 +81,17 @@ def test_spectra_become_definite_whatever_they_are(terms):
     assert torch.equal(found[..., 0], spectra[..., 0])
     corners = [(1.0, y, x, y * y, y * x, x * x)[:terms] for y in (-1, 0, 1) for x in (-1, 0, 1)]
     for weights in corners:
-        band = torch.einsum("c,cbzf->fbz", torch.tensor(weights, dtype=torch.complex64), found[..., 0, :])
+        band = torch.einsum(
+            "c,cbzf->fbz", torch.tensor(weights, dtype=torch.complex64), found[..., 0, :]
+        )
         for main, below in band:
             dense = torch.diag(main) + torch.diag(below[:-1], -1) + torch.diag(below[:-1].conj(), 1)
             assert float(torch.linalg.eigvalsh(dense)[0]) > 0
 
 
 def test_row_phase_is_kept_slice_by_slice():
-    """0.2 mm slices under 0.5 mm rows: the response of a slice depends on where it sits under the rows."""
+    """0.2 mm slices under 0.5 mm rows: the response of a slice depends on where it sits under
+    the rows."""
     A, w = problem(views=120, shape=(12, 9, 9), voxel=0.2, rows=10)
     spikes = torch.zeros(12, *A.domain_shape)
     spikes[torch.arange(12), torch.arange(12), 4, 4] = 1.0
@@ -99,7 +105,9 @@ def test_without_a_window_and_in_a_plane():
     A, w = problem(views=60, shape=(4, 7, 7), window=False)
     windowed, w2 = problem(views=60, shape=(4, 7, 7))
     x = tissue(A.grid)
-    assert torch.allclose(Gram(A, w).apply(x), Gram(windowed, w2).apply(x), rtol=1e-3, atol=1e-3 * float(w.max()) * HU)
+    assert torch.allclose(
+        Gram(A, w).apply(x), Gram(windowed, w2).apply(x), rtol=1e-3, atol=1e-3 * float(w.max()) * HU
+    )
     fan = FanBeam(full_turn(200), 626.0, 1098.0, 700, 0.7, detector="curved")
     grid = VolumeGrid((15, 15), 0.5, CENTER[1:])
     B = Projector(fan, grid, footprint(fan, grid))
@@ -115,11 +123,15 @@ def test_scaled_batched_and_differentiable(inset):
     x = torch.randn(2, 3, *A.domain_shape, generator=torch.Generator().manual_seed(1))
     y = gram.apply(x)
     assert torch.allclose(y[1, 2], gram.apply(x[1, 2]), rtol=1e-4, atol=1e-5 * float(y.abs().max()))
-    assert torch.allclose(gram.scaled(4.0).apply(x), 4 * y, rtol=1e-5, atol=1e-5 * float(y.abs().max()))
+    assert torch.allclose(
+        gram.scaled(4.0).apply(x), 4 * y, rtol=1e-5, atol=1e-5 * float(y.abs().max())
+    )
     leaf = x[0, 0].clone().requires_grad_()
     probe = x[1, 1]
     (gram.apply(leaf) * probe).sum().backward()
-    assert torch.allclose(leaf.grad, gram.apply(probe), rtol=1e-4, atol=1e-5 * float(leaf.grad.abs().max()))
+    assert torch.allclose(
+        leaf.grad, gram.apply(probe), rtol=1e-4, atol=1e-5 * float(leaf.grad.abs().max())
+    )
     assert gram.apply(x.double()).dtype == torch.float64
 
 
@@ -128,16 +140,22 @@ def test_information_follows_exposure_not_voxel_size(inset):
     assert gram.scaled(2.0).information(HU) == pytest.approx(2 * gram.information(HU))
     fine, w = problem(shape=(12, 33, 33), voxel=0.25)
     coarse, w2 = problem(shape=(8, 21, 21), voxel=0.4)
-    assert Gram(fine, w, 1).information(HU) == pytest.approx(Gram(coarse, w2, 1).information(HU), rel=0.15)
+    assert Gram(fine, w, 1).information(HU) == pytest.approx(
+        Gram(coarse, w2, 1).information(HU), rel=0.15
+    )
 
 
 def test_noise_has_the_covariance_of_the_data(inset):
     A, w, gram = inset
     n = 4000
     draws = gram.noise((n,), generator=torch.Generator().manual_seed(3)).reshape(n, -1).double()
-    assert torch.equal(gram.noise((2,), generator=torch.Generator().manual_seed(5)),
-                       gram.noise((2,), generator=torch.Generator().manual_seed(5)))  # fmt: skip
-    probes = torch.stack([tissue(A.grid), torch.randn(A.domain_shape, generator=torch.Generator().manual_seed(4))])
+    assert torch.equal(
+        gram.noise((2,), generator=torch.Generator().manual_seed(5)),
+        gram.noise((2,), generator=torch.Generator().manual_seed(5)),
+    )
+    probes = torch.stack(
+        [tissue(A.grid), torch.randn(A.domain_shape, generator=torch.Generator().manual_seed(4))]
+    )
     for probe in probes.double():
         variance = float((draws @ probe.flatten()).var())
         expected = float((A(probe).square() * w).sum())

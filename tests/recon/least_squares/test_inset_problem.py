@@ -24,7 +24,8 @@ def test_noise_free_values_in_hu(clean, problem):
     ball, fat = inner(volume.data)
     reference = inner(reconstruct(clean, GRID, "fbp", kernel="soft").data)
     assert fat == pytest.approx(reference[1], abs=3)
-    assert ball == pytest.approx(97.0, abs=8)  # of the transmitted spectrum, see the paper's target of 100
+    # of the transmitted spectrum, see the paper's target of 100
+    assert ball == pytest.approx(97.0, abs=8)
     assert volume.report["converged"]
     assert volume.report["rmsd_hu"][-1] <= volume.report["tolerance_hu"]
     assert volume.report["exact_pairs"] >= 1
@@ -41,11 +42,15 @@ def test_batch_equals_single(clean, problem):
 
 
 def test_prior_lowers_the_noise(clean, problem):
-    """Noise (noisy − noise free) inside the inset: below that of the standard kernel, and falling with the strength."""
+    """Noise (noisy − noise free) inside the inset: below that of the standard kernel, and
+    falling with the strength."""
     noisy = clean.with_noise(0.35, 5)
 
     def noise(method, **options):
-        difference = reconstruct(noisy, GRID, method, **options).data - reconstruct(clean, GRID, method, **options).data
+        difference = (
+            reconstruct(noisy, GRID, method, **options).data
+            - reconstruct(clean, GRID, method, **options).data
+        )
         return float(difference[2:-2, 4:-4, 4:-4].std())
 
     fbp = noise("fbp", kernel="standard")
@@ -55,7 +60,9 @@ def test_prior_lowers_the_noise(clean, problem):
 
 def test_an_unfinished_iteration_warns_on_the_volume(clean, problem):
     with pytest.warns(RuntimeWarning, match="raise max_exact"):
-        volume = reconstruct(clean, GRID, "pwls", prior=WEAK, problem=problem, tolerance=1e-9, max_exact=1)
+        volume = reconstruct(
+            clean, GRID, "pwls", prior=WEAK, problem=problem, tolerance=1e-9, max_exact=1
+        )
     assert "raise max_exact" in volume.report["warnings"][0]
     assert reconstruct(clean, GRID, "pwls", prior=WEAK, problem=problem).report["warnings"] == []
 
@@ -64,19 +71,27 @@ def test_refusals(clean):
     whole = replace(clean, geometry=clean.geometry, window=clean.window)
     with pytest.raises(ValueError, match="one exposure"):
         InsetProblem(clean, GRID).solve([clean.with_noise(1.0, 0), clean.with_noise(2.0, 0)], WEAK)
-    spectral = replace(whole, counts=clean.counts[None], air=clean.air[None], surround=clean.surround[None])
+    spectral = replace(
+        whole, counts=clean.counts[None], air=clean.air[None], surround=clean.surround[None]
+    )
     refused(
         ("photon counts", lambda: InsetProblem(replace(clean, counting=False), GRID)),
         ("counting-mode", lambda: reconstruct(spectral, GRID, "pwls")),
-        ("region", lambda: reconstruct(clean, VolumeGrid((8, 18, 18), 0.4, (0.0, 0.0, 60.0)), "pwls")),
+        (
+            "region",
+            lambda: reconstruct(clean, VolumeGrid((8, 18, 18), 0.4, (0.0, 0.0, 60.0)), "pwls"),
+        ),
     )
 
 
 def test_the_default_prior_follows_the_noise(clean, problem):
-    """A hundredth of the dose: 10 times the noise; a threshold in HU/mm would let single voxels pass as edges (21)."""
+    """A hundredth of the dose: 10 times the noise; a threshold in HU/mm would let single voxels
+    pass as edges (21)."""
     found, thresholds = {}, {}
     for exposure in (2.0, 0.02):
-        volume = reconstruct(clean.with_noise(exposure, 0), GRID, "pwls", problem=problem, tolerance=3.0)
+        volume = reconstruct(
+            clean.with_noise(exposure, 0), GRID, "pwls", problem=problem, tolerance=3.0
+        )
         found[exposure] = float((volume.data - volume.data.mean()).std())
         thresholds[exposure] = volume.report["threshold_hu_per_mm"]
     assert thresholds[0.02] == pytest.approx(10 * thresholds[2.0], rel=1e-3)

@@ -1,4 +1,5 @@
-"""Two channels: joint reconstruction against dense float64 minima, its hard cases, whitening, basis images."""
+"""Two channels: joint reconstruction against dense float64 minima, its hard cases, whitening,
+basis images."""
 
 import math
 
@@ -20,7 +21,8 @@ EDGE = QGGMRF(0.15, 100.0)
 
 
 def anisotropic(w, seed=5):
-    """2 × 2 information whose two variances and correlation change from ray to ray by tens of per cent."""
+    """2 × 2 information whose two variances and correlation change from ray to ray by tens of
+    per cent."""
     rng = torch.Generator().manual_seed(seed)
     first = w * (1 + 0.3 * torch.rand(w.shape, generator=rng))
     second = w * (1 - 0.3 * torch.rand(w.shape, generator=rng))
@@ -29,7 +31,9 @@ def anisotropic(w, seed=5):
 
 
 def tissue(grid):
-    _, y, x = np.meshgrid(*(a - c for a, c in zip(grid.axes, grid.center, strict=True)), indexing="ij")
+    _, y, x = np.meshgrid(
+        *(a - c for a, c in zip(grid.axes, grid.center, strict=True)), indexing="ij"
+    )
     disc = (np.hypot(y, x - 0.3) < 1.2).astype(float)
     core = (np.hypot(y - 0.4, x) < 0.7).astype(float)
     return torch.from_numpy(np.stack([160 * disc - 60 * core, 300 * disc + 80 * core])).float()
@@ -42,7 +46,9 @@ def correlated_noise(f, shape, seed):
     l11 = f11.sqrt()
     l21 = f12 / l11
     l22 = (f22 - l21**2).sqrt()
-    n = torch.randn((2, *shape, *f11.shape), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    n = torch.randn(
+        (2, *shape, *f11.shape), generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
     second = n[1] / l22
     first = (n[0] - l21 * second) / l11
     return torch.stack([first, second], dim=len(shape)).float()
@@ -85,7 +91,9 @@ def rms(a, b):
 def test_exact_minimum(inset, dense, prior):
     A, f, gram, y = inset
     bound = prior.bind(gram.information(1.0), A.grid.spacing, 1.0, channels=True)
-    fine = pwls(A, y.double(), f.double(), prior, mu_per_hu=1.0, gram=gram, tolerance=1e-6, max_exact=80)
+    fine = pwls(
+        A, y.double(), f.double(), prior, mu_per_hu=1.0, gram=gram, tolerance=1e-6, max_exact=80
+    )
     x = reference(dense, f, y, bound, A.domain_shape, fine.x)
     result = pwls(A, y, f, prior, mu_per_hu=1.0, gram=gram, tolerance=0.02)
     assert result.report["converged"]
@@ -113,7 +121,8 @@ def test_certificate_is_the_gradient_of_the_objective(inset):
 
 
 def test_correlation_that_changes_from_ray_to_ray_is_information():
-    """Where the sign of the correlation alternates, the cross terms hold 81 % of the variance (separate: 1 / 0.19)."""
+    """Where the sign of the correlation alternates, the cross terms hold 81 % of the variance
+    (separate: 1 / 0.19)."""
     A, w = problem(views=60, shape=(3, 8, 8), rows=6)
     w = w * 1e-5
     sign = torch.where(torch.arange(60) % 2 == 0, 1.0, -1.0)[:, None, None]
@@ -124,9 +133,15 @@ def test_correlation_that_changes_from_ray_to_ray_is_information():
     joint = pwls(A, y, f, weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60).x
     alone = pwls(A, y, w * (1 - 0.81), weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60).x
     clean = A(truth).expand_as(y)
-    scatter = rms(joint, pwls(A, clean[0], f, weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60).x.expand_as(joint))
+    scatter = rms(
+        joint,
+        pwls(A, clean[0], f, weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60).x.expand_as(joint),
+    )
     apart = rms(
-        alone, pwls(A, clean[0], w * (1 - 0.81), weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60).x.expand_as(alone)
+        alone,
+        pwls(
+            A, clean[0], w * (1 - 0.81), weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60
+        ).x.expand_as(alone),
     )
     assert scatter == pytest.approx(math.sqrt(0.19) * apart, rel=0.15)
 
@@ -135,10 +150,20 @@ def test_lost_rays_may_hold_anything(inset):
     A, f, _, y = inset
     lost = torch.rand(A.range_shape, generator=torch.Generator().manual_seed(4)) < 0.1
     f = torch.where(lost, torch.zeros(()), f)
-    result = pwls(A, torch.where(lost, torch.nan, y), f, EDGE, mu_per_hu=1.0, tolerance=0.1, max_exact=40)
+    result = pwls(
+        A, torch.where(lost, torch.nan, y), f, EDGE, mu_per_hu=1.0, tolerance=0.1, max_exact=40
+    )
     assert result.report["converged"]
     bound = EDGE.bind(Gram(A, mean_weights(f)).information(1.0), A.grid.spacing, 1.0, channels=True)
-    full = pwls(A, torch.where(lost, torch.zeros(()), y), f, bound, mu_per_hu=1.0, tolerance=0.1, max_exact=40)
+    full = pwls(
+        A,
+        torch.where(lost, torch.zeros(()), y),
+        f,
+        bound,
+        mu_per_hu=1.0,
+        tolerance=0.1,
+        max_exact=40,
+    )
     assert rms(result.x, full.x) < 0.3
 
 
@@ -147,7 +172,10 @@ def test_refusals(inset):
     refused(
         ("information", lambda: pwls(A, y, f.int(), EDGE, mu_per_hu=1.0)),
         ("shape", lambda: pwls(A, y, f[:2], EDGE, mu_per_hu=1.0)),
-        ("semi-definite", lambda: pwls(A, y, torch.stack([f[0], 2 * f[2], f[2]]), EDGE, mu_per_hu=1.0)),
+        (
+            "semi-definite",
+            lambda: pwls(A, y, torch.stack([f[0], 2 * f[2], f[2]]), EDGE, mu_per_hu=1.0),
+        ),
         ("finite", lambda: pwls(A, y, f * torch.nan, EDGE, mu_per_hu=1.0)),
         ("all information is 0", lambda: pwls(A, y, 0 * f, EDGE, mu_per_hu=1.0)),
         ("y must", lambda: pwls(A, y.int(), f, EDGE, mu_per_hu=1.0, gram=gram)),
@@ -162,21 +190,28 @@ def test_whitening_makes_noise_equal_and_uncorrelated():
     w = Whitening.of(f, gain)
     covariance = np.linalg.inv([[f[0], f[1]], [f[1], f[2]]])
     mixed = w.forward @ covariance @ w.forward.T
-    np.testing.assert_allclose(mixed, np.eye(2) * (gain @ covariance @ gain), rtol=1e-9, atol=1e-6 * mixed[0, 0])
+    np.testing.assert_allclose(
+        mixed, np.eye(2) * (gain @ covariance @ gain), rtol=1e-9, atol=1e-6 * mixed[0, 0]
+    )
     np.testing.assert_allclose(w.forward[0], gain)
     x = torch.rand(4, 2, 2, 3, 5, dtype=torch.float64)
     torch.testing.assert_close(w.undo(w.apply(x)), x)
     # Information follows the congruence, here of a tensor of rays.
     packed = torch.from_numpy(f).reshape(3, 1, 1).expand(3, 4, 5)
     white = w.information(packed)
-    np.testing.assert_allclose(white[:, 0, 0], np.array([1, 0, 1]) / (gain @ covariance @ gain), atol=1e-12)
+    np.testing.assert_allclose(
+        white[:, 0, 0], np.array([1, 0, 1]) / (gain @ covariance @ gain), atol=1e-12
+    )
 
 
 def test_whitening_refuses():
     refused(
         ("positive definite", lambda: Whitening.of((1.0, 2.0, 1.0), (1.0, 0.0))),
         ("gain", lambda: Whitening.of((1.0, 0.0, 1.0), (0.0, 0.0))),
-        ("two channels", lambda: Whitening.of((1.0, 0.0, 1.0), (1.0, 0.0)).apply(torch.zeros(3, 2, 2, 2))),
+        (
+            "two channels",
+            lambda: Whitening.of((1.0, 0.0, 1.0), (1.0, 0.0)).apply(torch.zeros(3, 2, 2, 2)),
+        ),
     )
 
 

@@ -22,7 +22,11 @@ def inset():
 
 def noisy(A, w, seed=0, batch=()):
     clean = A(tissue(A.grid)).expand(*batch, *A.range_shape)
-    return clean + torch.randn(clean.shape, generator=torch.Generator().manual_seed(seed)) / w.clamp_min(1e-3).sqrt()
+    return (
+        clean
+        + torch.randn(clean.shape, generator=torch.Generator().manual_seed(seed))
+        / w.clamp_min(1e-3).sqrt()
+    )
 
 
 def hu_rms(a, b):
@@ -42,14 +46,24 @@ def reference(dense, A, w, y, prior, information):
     return minimum(H, b, prior.bind(information, A.grid.spacing, HU), A.domain_shape, 1e-7 * HU)
 
 
-@pytest.mark.parametrize("prior", [QGGMRF(0.3, 4.0, relative=True), quadratic(0.01)], ids=["edge-preserving", "weak"])
+@pytest.mark.parametrize(
+    "prior", [QGGMRF(0.3, 4.0, relative=True), quadratic(0.01)], ids=["edge-preserving", "weak"]
+)
 def test_distance_is_right_where_the_model_converges_slowly(prior):
     """A shift-invariant model of few views: each step is a fifth or half of the one before."""
     A, w = problem(views=60, shape=(6, 21, 21), rows=8)
     y = noisy(A, w)
     gram = Gram(A, w, nodes=1)
     bound = prior.bind(gram.information(HU), A.grid.spacing, HU)
-    exact = pwls(A, y.double(), w.double(), bound, mu_per_hu=HU, gram=Gram(A, w.double(), nodes=1), tolerance=1e-3).x
+    exact = pwls(
+        A,
+        y.double(),
+        w.double(),
+        bound,
+        mu_per_hu=HU,
+        gram=Gram(A, w.double(), nodes=1),
+        tolerance=1e-3,
+    ).x
     for tolerance in (2.0, 0.2):
         found = pwls(A, y, w, bound, mu_per_hu=HU, gram=gram, tolerance=tolerance)
         assert found.report["model"] == "gram"
@@ -113,7 +127,8 @@ def test_lost_readings(inset, dense, case):
 
 
 def test_low_dose_is_the_same_problem_scaled(inset):
-    """1/100 of the dose with the noise in the same units: strength is noise-normalised, so x is the same."""
+    """1/100 of the dose with the noise in the same units: strength is noise-normalised, so x is
+    the same."""
     A, w, gram, y = inset
     full = pwls(A, y, w, quadratic(0.15), mu_per_hu=HU, gram=gram, tolerance=0.02)
     low = pwls(A, y, w / 100, quadratic(0.15), mu_per_hu=HU, gram=gram.scaled(0.01), tolerance=0.02)
@@ -134,7 +149,9 @@ def test_from_the_sufficient_statistic(inset):
     """The problem of the model, without a projector, is close to the exact one."""
     A, w, gram, y = inset
     b = A.T(w * y)
-    model = solve_normal(b, gram.apply, gram, EDGE, mu_per_hu=HU, spacing=A.grid.spacing, tolerance=0.05)
+    model = solve_normal(
+        b, gram.apply, gram, EDGE, mu_per_hu=HU, spacing=A.grid.spacing, tolerance=0.05
+    )
     exact = pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.05)
     assert hu_rms(model.x, exact.x) < 0.1 * hu_rms(exact.x, torch.zeros(()))
     assert model.report["converged"]
@@ -143,8 +160,16 @@ def test_from_the_sufficient_statistic(inset):
 def test_refusals(inset):
     A, w, gram, y = inset
     refused(
-        ("weight 0", lambda: pwls(A, torch.full_like(y, torch.nan), w, EDGE, mu_per_hu=HU, gram=gram)),
+        (
+            "weight 0",
+            lambda: pwls(A, torch.full_like(y, torch.nan), w, EDGE, mu_per_hu=HU, gram=gram),
+        ),
         ("tolerance", lambda: pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, tolerance=0.0)),
-        ("start", lambda: pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, start=torch.full(A.domain_shape, torch.nan))),
+        (
+            "start",
+            lambda: pwls(
+                A, y, w, EDGE, mu_per_hu=HU, gram=gram, start=torch.full(A.domain_shape, torch.nan)
+            ),
+        ),
         ("max_exact", lambda: pwls(A, y, w, EDGE, mu_per_hu=HU, gram=gram, max_exact=0)),
     )

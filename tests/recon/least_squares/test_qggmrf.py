@@ -30,9 +30,13 @@ def test_potential_is_the_published_one(p, q, threshold):
     if math.isinf(threshold):
         expected = t**2 / 2
     else:
-        expected = t.abs() ** p * threshold ** (2 - p) / (p * (1 + (t.abs() / threshold) ** (p - q)))
+        expected = (
+            t.abs() ** p * threshold ** (2 - p) / (p * (1 + (t.abs() / threshold) ** (p - q)))
+        )
     tolerance = 1e-12 if p == 2.0 else 2e-3  # below p = 2 the tip is rounded
-    assert torch.allclose(prior.potential(t), expected, rtol=tolerance, atol=tolerance * threshold**2 if p < 2 else 0)
+    assert torch.allclose(
+        prior.potential(t), expected, rtol=tolerance, atol=tolerance * threshold**2 if p < 2 else 0
+    )
 
 
 @pytest.mark.parametrize(("p", "q", "threshold"), FORMS)
@@ -41,7 +45,9 @@ def test_gradient_is_the_derivative_of_the_value(p, q, threshold, neighbors):
     prior = bound(p, q, threshold, neighbors)
     x = volume(2, 4, 5, 6).requires_grad_()
     prior.value(x).sum().backward()
-    assert torch.allclose(prior.gradient(x.detach()), x.grad, rtol=1e-9, atol=1e-9 * float(x.grad.abs().max()))
+    assert torch.allclose(
+        prior.gradient(x.detach()), x.grad, rtol=1e-9, atol=1e-9 * float(x.grad.abs().max())
+    )
 
 
 @pytest.mark.parametrize(("p", "q", "threshold"), FORMS)
@@ -49,7 +55,9 @@ def test_fused_passes_equal_the_plain_ones(p, q, threshold):
     prior = bound(p, q, threshold)
     x, v, u = (volume(3, 5, 6, 7, seed=s) for s in range(3))
     plain = prior._plain_majorizer(x, v)
-    assert torch.allclose(prior.majorizer(x, v), plain, rtol=1e-10, atol=1e-12 * float(plain.abs().max()))
+    assert torch.allclose(
+        prior.majorizer(x, v), plain, rtol=1e-10, atol=1e-12 * float(plain.abs().max())
+    )
     pull, bend = prior.along(x, v, u)
     assert torch.allclose(pull, (v * prior._plain_majorizer(x, x)).sum((1, 2, 3)), rtol=1e-9)
     assert torch.allclose(bend, (v * prior._plain_majorizer(x, u)).sum((1, 2, 3)), rtol=1e-9)
@@ -62,14 +70,18 @@ def test_fused_passes_in_a_plane_and_in_single_precision():
     assert torch.allclose(prior.majorizer(x, x), prior._plain_majorizer(x, x), rtol=1e-10)
     single = prior.majorizer(x.float(), x.float())
     assert single.dtype == torch.float32
-    assert torch.allclose(single.double(), prior.gradient(x), rtol=1e-4, atol=1e-5 * float(single.abs().max()))
+    assert torch.allclose(
+        single.double(), prior.gradient(x), rtol=1e-4, atol=1e-5 * float(single.abs().max())
+    )
 
 
 @settings(max_examples=40, deadline=None)
 @given(
-    st.floats(-3000, 3000), st.floats(-3000, 3000), st.floats(1, 1000),
+    st.floats(-3000, 3000),
+    st.floats(-3000, 3000),
+    st.floats(1, 1000),
     st.sampled_from([(2.0, 1.0), (2.0, 1.5), (1.5, 1.0), (2.0, 2.0)]),
-)  # fmt: skip
+)
 def test_parabola_touches_and_lies_above(t, s, threshold, form):
     prior = bound(*form, threshold)
     a, b = torch.tensor([t], dtype=torch.float64), torch.tensor([s], dtype=torch.float64)
@@ -111,22 +123,28 @@ def test_spectrum_is_that_of_the_periodic_matrix():
     wave = torch.zeros(shape, dtype=torch.float64)
     wave[3, 4, 2] = 1.0
     response = torch.fft.irfftn(prior.spectrum(shape) * torch.fft.rfftn(wave), s=shape)
-    assert torch.allclose(response, prior._plain_majorizer(wave, wave), atol=1e-9 * float(response.max()))
+    assert torch.allclose(
+        response, prior._plain_majorizer(wave, wave), atol=1e-9 * float(response.max())
+    )
 
 
-# -- several channels -------------------------------------------------------------------------------------------------
+# -- several channels ------------------------------------------------------------------------------
 
 
 def both(prior, spacing):
     return prior.bind(0.01, spacing, 1.0, channels=True)
 
 
-@pytest.mark.parametrize("prior", [quadratic(1.0), EDGE, QGGMRF(1.0, 50.0, 1.8, 1.1), QGGMRF(1.0, 50.0, 2.0, 1.3, 6)])
+@pytest.mark.parametrize(
+    "prior", [quadratic(1.0), EDGE, QGGMRF(1.0, 50.0, 1.8, 1.1), QGGMRF(1.0, 50.0, 2.0, 1.3, 6)]
+)
 @pytest.mark.parametrize("shape", [(3, 4, 5), (5, 6)])
 def test_kernels_of_channels_are_the_gradient_of_the_value(prior, shape):
     joint = both(prior, (0.5, 0.4, 0.3)[-len(shape) :])
     generator = torch.Generator().manual_seed(1)
-    x, v, u = (100 * torch.randn(2, 2, *shape, generator=generator, dtype=torch.float64) for _ in range(3))
+    x, v, u = (
+        100 * torch.randn(2, 2, *shape, generator=generator, dtype=torch.float64) for _ in range(3)
+    )
     at = x.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(joint.value(at).sum(), at)
     torch.testing.assert_close(joint.gradient(x), gradient)
@@ -138,9 +156,12 @@ def test_kernels_of_channels_are_the_gradient_of_the_value(prior, shape):
 
 
 def test_channels_may_be_turned():
-    """Only the length of the difference counts: a rotation of the channels changes nothing, and one is the scalar."""
+    """Only the length of the difference counts: a rotation of the channels changes nothing, and
+    one is the scalar."""
     joint, scalar = both(EDGE, (0.5,) * 3), EDGE.bind(0.01, (0.5,) * 3, 1.0)
-    x = 100 * torch.randn(2, 4, 5, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    x = 100 * torch.randn(
+        2, 4, 5, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(2)
+    )
     c, s = math.cos(0.7), math.sin(0.7)
     turned = torch.stack([c * x[0] - s * x[1], s * x[0] + c * x[1]])
     torch.testing.assert_close(joint.value(turned), joint.value(x))

@@ -36,7 +36,8 @@ def test_nothing_is_left_of_a_uniform_inset(lines):
 
 
 def test_what_the_inset_holds_stays_its_own(lines):
-    """A ball in it: its readings are left, and nothing of it is taken for surround (once 12 % were)."""
+    """A ball in it: its readings are left, and nothing of it is taken for surround (once 12 %
+    were)."""
     window = footprint(GEOMETRY, GRID, margin=1)
     projector = Projector(GEOMETRY, GRID, window)
     z, y, x = np.meshgrid(*GRID.axes, indexing="ij")

@@ -1,4 +1,5 @@
-"""PWLS of whole fields of view: dense float64 minima, monotony, honest stops, the choice of the model, memory."""
+"""PWLS of whole fields of view: dense float64 minima, monotony, honest stops, the choice of the
+model, memory."""
 
 import itertools
 import math
@@ -20,8 +21,14 @@ EDGE = QGGMRF(0.3, 4.0, relative=True)
 FLAT = QGGMRF(0.3, 300.0)
 SCANS = {
     # A dead column runs through all views.
-    "parallel": (ParallelBeam(torch.arange(40).numpy() * math.pi / 40, 26, 1.0), VolumeGrid((18, 18), 1.0)),
-    "short fan": (FanBeam(full_turn(60)[:36], 90.0, 150.0, 48, 1.0), VolumeGrid((20, 22), 1.0, (1.0, -0.5))),
+    "parallel": (
+        ParallelBeam(torch.arange(40).numpy() * math.pi / 40, 26, 1.0),
+        VolumeGrid((18, 18), 1.0),
+    ),
+    "short fan": (
+        FanBeam(full_turn(60)[:36], 90.0, 150.0, 48, 1.0),
+        VolumeGrid((20, 22), 1.0, (1.0, -0.5)),
+    ),
     "cone": (ConeBeam(full_turn(40), 60.0, 100.0, 30, 14, 1.2), VolumeGrid((5, 12, 12), 1.2)),
 }
 
@@ -33,22 +40,30 @@ def scan(request):
     A = Projector(geometry, grid)
     r = [torch.from_numpy(a) for a in grid.axes]
     y, x = torch.meshgrid(r[-2], r[-1], indexing="ij")
-    body = 0.02 * (torch.hypot(y, x) < 0.4 * grid.extent[-1]) + 0.02 * (torch.hypot(y - 2, x + 3) < 2)
+    body = 0.02 * (torch.hypot(y, x) < 0.4 * grid.extent[-1]) + 0.02 * (
+        torch.hypot(y - 2, x + 3) < 2
+    )
     truth = body.expand(grid.shape).float()
     lines = A(truth)
     w = 4e4 * torch.exp(-4 * lines / lines.max())
     if request.param == "parallel":
         w[:, 9] = 0
-    data = lines + torch.randn(lines.shape, generator=torch.Generator().manual_seed(3)) / w.clamp_min(1).sqrt()
+    data = (
+        lines
+        + torch.randn(lines.shape, generator=torch.Generator().manual_seed(3))
+        / w.clamp_min(1).sqrt()
+    )
     return A, data, w, dense(A)
 
 
 def test_voxels_too_large_for_the_reference_frequency():
-    """Voxels of 2 mm do not hold 0.5 lp/mm: their information is read off where they do (once it was negative)."""
+    """Voxels of 2 mm do not hold 0.5 lp/mm: their information is read off where they do (once it
+    was negative)."""
     geometry = FanBeam(full_turn(120), 600.0, 1000.0, 150, 500.0 / 150)
     weights = torch.full(geometry.shape, 1e5)
     small, large = (
-        FieldModel(Projector(geometry, VolumeGrid((n, n), 200.0 / n)), weights).information(HU) for n in (96, 64)
+        FieldModel(Projector(geometry, VolumeGrid((n, n), 200.0 / n)), weights).information(HU)
+        for n in (96, 64)
     )
     assert 0.5 < small / large < 1.0
 
@@ -93,7 +108,17 @@ def test_every_pair_lowers_the_objective(scan):
     for start in (3000 * HU * noise, exact.float() + 5 * HU * noise, exact.float()):
         values = [energy(matrix, y, w, bound, start)]
         for pairs in range(2, 9):
-            x = pwls(A, y, w, bound, mu_per_hu=HU, gram=model, start=start, tolerance=1e-9, max_exact=pairs).x
+            x = pwls(
+                A,
+                y,
+                w,
+                bound,
+                mu_per_hu=HU,
+                gram=model,
+                start=start,
+                tolerance=1e-9,
+                max_exact=pairs,
+            ).x
             values.append(energy(matrix, y, w, bound, x))
         slack = 1e-6 * energy(matrix, y, w, bound, torch.zeros(A.domain_shape))
         assert all(b <= a + slack for a, b in itertools.pairwise(values)), values
@@ -109,8 +134,11 @@ def test_batch_is_each_alone(scan):
 
 
 def test_voxels_that_some_views_miss_converge_last_and_that_is_said():
-    """Corners beyond the field of view hang on the prior alone; inside, the volume is at the minimum long before."""
-    A = Projector(ParallelBeam(torch.arange(40).numpy() * math.pi / 40, 26, 1.0), VolumeGrid((24, 24), 1.0))
+    """Corners beyond the field of view hang on the prior alone; inside, the volume is at the
+    minimum long before."""
+    A = Projector(
+        ParallelBeam(torch.arange(40).numpy() * math.pi / 40, 26, 1.0), VolumeGrid((24, 24), 1.0)
+    )
     r = torch.hypot(*torch.meshgrid(*[torch.from_numpy(a) for a in A.grid.axes], indexing="ij"))
     y = A((0.02 * (r < 10)).float())
     w = 4e4 * torch.exp(-4 * y / y.max())
@@ -138,7 +166,11 @@ def flat_faces():
     z, y, x = torch.meshgrid(*[torch.from_numpy(a) for a in A.grid.axes], indexing="ij")
     lines = A((0.02 * ((torch.hypot(y, x) < 10) & (z.abs() < 8))).float())
     w = 1e5 * torch.exp(-lines)
-    return A, lines + torch.randn(lines.shape, generator=torch.Generator().manual_seed(0)) / w.sqrt(), w
+    return (
+        A,
+        lines + torch.randn(lines.shape, generator=torch.Generator().manual_seed(0)) / w.sqrt(),
+        w,
+    )
 
 
 def test_flat_faces_in_a_cone_beam_need_a_spectrum_of_their_own_slice(flat_faces, monkeypatch):
@@ -162,7 +194,9 @@ def test_slices_beyond_the_rows_do_not_slow_the_rest_down(monkeypatch):
     assert float((FieldModel(A, w).seen == 0).float().mean()) > 0.1
     found = pwls(A, y, w, EDGE, mu_per_hu=HU, tolerance=0.3)
     monkeypatch.setattr(field_model, "LEAST_MET", 1e-4)
-    slow = pwls(A, y, w, EDGE, mu_per_hu=HU, tolerance=0.3, max_exact=2 * found.report["exact_pairs"])
+    slow = pwls(
+        A, y, w, EDGE, mu_per_hu=HU, tolerance=0.3, max_exact=2 * found.report["exact_pairs"]
+    )
     assert found.report["converged"]
     assert not slow.report["converged"]
 
@@ -172,7 +206,8 @@ def test_slices_share_the_field(flat_faces):
     model = FieldModel(A, w)
     assert len(model.nodes) == field_model.NODES
     assert float(sum(s.square() for _, s in model.nodes).sub(1).abs().max()) < 1e-6
-    # By symmetry the slices above the middle see what those below see; the further out, the less along z.
+    # By symmetry the slices above the middle see what those below see; the further out, the less
+    # along z.
     along = [float(k[:, 0, 0].log().mean()) for k, _ in model.nodes]
     assert along == pytest.approx(along[::-1], abs=0.1)
     assert along[0] < along[1] < along[2]
@@ -211,7 +246,9 @@ def test_memory_is_predicted_and_refused_before_anything_is_allocated(scan, monk
     monkeypatch.setattr(Projector, "forward", lambda self, x: pytest.fail("projected"))
     with pytest.raises(ValueError, match=r"needs .* GiB, 0.00 GiB are available"):
         pwls(A, y, w, EDGE, mu_per_hu=HU, memory=1000)
-    big = Projector(ConeBeam(full_turn(4), 6000.0, 10000.0, 8, 8, 1.0), VolumeGrid((3000, 3000, 3000), 1e-3))
+    big = Projector(
+        ConeBeam(full_turn(4), 6000.0, 10000.0, 8, 8, 1.0), VolumeGrid((3000, 3000, 3000), 1e-3)
+    )
     with pytest.raises(ValueError, match="larger or fewer voxels"):
         pwls(big, torch.zeros(big.range_shape), torch.ones(big.range_shape), EDGE, memory=2**38)
 
@@ -223,7 +260,8 @@ def test_rays_that_miss_the_grid_are_refused():
 
 
 def test_the_distance_to_the_limit_of_a_geometric_approach():
-    """Known exactly: x_k = 1 − 0.9ᵏ is 0.9ᵏ from its limit; an estimate may be high, by what the lag costs, not low."""
+    """Known exactly: x_k = 1 − 0.9ᵏ is 0.9ᵏ from its limit; an estimate may be high, by what the
+    lag costs, not low."""
     where = torch.arange(500) < 400
     start = torch.zeros(2, 500)
     seen, beyond = Approach(start, where), Approach(start, ~where)
@@ -241,7 +279,8 @@ def test_the_distance_to_the_limit_of_a_geometric_approach():
 
 
 def test_an_approach_that_gets_faster_is_seen():
-    """As conjugate gradients often do; by the last quarter of the way alone it would be 26 and 62 times too long."""
+    """As conjugate gradients often do; by the last quarter of the way alone it would be 26 and
+    62 times too long."""
     approach = Approach(torch.ones(1, 500, dtype=torch.float64))
     for k in range(1, 61):
         left = math.exp(-((k / 12) ** 1.5))
@@ -251,12 +290,16 @@ def test_an_approach_that_gets_faster_is_seen():
 
 
 def test_corners_do_not_hold_the_stop_and_are_reported():
-    A = Projector(ParallelBeam(torch.arange(40).numpy() * math.pi / 40, 26, 1.0), VolumeGrid((26, 26), 1.0))
+    A = Projector(
+        ParallelBeam(torch.arange(40).numpy() * math.pi / 40, 26, 1.0), VolumeGrid((26, 26), 1.0)
+    )
     r = torch.hypot(*torch.meshgrid(*[torch.from_numpy(a) for a in A.grid.axes], indexing="ij"))
     w = 4e4 * torch.ones(A.range_shape)
     model = FieldModel(A, w)
     assert bool(model.determined[r < 12].all())
     assert not bool(model.determined[r > 15].any())
-    report = pwls(A, A((0.02 * (r < 10)).float()), w, EDGE, mu_per_hu=HU, tolerance=1.0, gram=model).report
+    report = pwls(
+        A, A((0.02 * (r < 10)).float()), w, EDGE, mu_per_hu=HU, tolerance=1.0, gram=model
+    ).report
     assert report["undetermined"] == pytest.approx(1 - float(model.determined.float().mean()))
     assert report["undetermined_rmsd_hu"] > 0

@@ -23,10 +23,18 @@ def volumes(shape=(2, 6, 7, 8), seed=0):
 def by_definition(u, guide, threshold, reach=2.5, step=1):
     """The sum over all pairs of voxels."""
     out = torch.empty_like(u, dtype=torch.float64)
-    at = torch.stack(torch.meshgrid(*[torch.arange(n) for n in u.shape[1:]], indexing="ij"), -1).reshape(-1, 3).double()
+    at = (
+        torch.stack(torch.meshgrid(*[torch.arange(n) for n in u.shape[1:]], indexing="ij"), -1)
+        .reshape(-1, 3)
+        .double()
+    )
     apart = at[:, None] - at
     square = apart.square().sum(-1)
-    near = torch.exp(-0.5 * square / reach**2) * (square <= (2 * reach) ** 2) * (apart % step == 0).all(-1)
+    near = (
+        torch.exp(-0.5 * square / reach**2)
+        * (square <= (2 * reach) ** 2)
+        * (apart % step == 0).all(-1)
+    )
     for b in range(len(u)):
         g, v = guide[b].double().flatten(), u[b].double().flatten()
         alike = (1 - ((g[:, None] - g) / threshold[b]).square() / 4).clamp_min(0).square()
@@ -55,7 +63,9 @@ def test_without_noise_nothing_is_filtered_and_nan_raises_nothing():
 @pytest.mark.parametrize("which", [0, 1])
 def test_gradients(which):
     given = list(volumes((2, 4, 5, 6)))
-    push, seen = (torch.randn(2, 4, 5, 6, generator=torch.Generator().manual_seed(k)) for k in (3, 4))
+    push, seen = (
+        torch.randn(2, 4, 5, 6, generator=torch.Generator().manual_seed(k)) for k in (3, 4)
+    )
     given[which].requires_grad_()
     (joint_bilateral(*given, T) * seen).sum().backward()
     slope = float((given[which].grad * push).sum())
@@ -94,7 +104,8 @@ CONFIG = NetworkConfig((6, 8, 8), 0.4, local_mm=1.6, turns=True, bilateral=True)
 
 
 def test_the_network_starts_from_half_of_it():
-    """With its last layer off it gives the filtered volume's share; turned and shifted scenes come along."""
+    """With its last layer off it gives the filtered volume's share; turned and shifted scenes
+    come along."""
     torch.manual_seed(0)
     network = Network(CONFIG).eval().requires_grad_(False)
     u, towards = volumes((1, 8, 8, 8))
@@ -119,15 +130,20 @@ def test_the_network_starts_from_half_of_it():
 @settings(max_examples=30, deadline=None)
 @given(st.floats(-50, 50), st.floats(0.1, 3.0), st.floats(0.0, 4.0), st.integers(0, 1000))
 def test_overshoot_of_strong_edges_is_cut_off_and_weak_structures_stay(level, noise, ripple, seed):
-    """Within 5 voxels of a step of 30 guide noises nothing leaves the range of the filter's values."""
+    """Within 5 voxels of a step of 30 guide noises nothing leaves the range of the filter's
+    values."""
     sd = torch.tensor([noise])
     smoothed = torch.full((1, 6, 6, 40), level)
     smoothed[..., :10] += 30 * noise
-    u = smoothed + ripple * noise * torch.randn(smoothed.shape, generator=torch.Generator().manual_seed(seed))
+    u = smoothed + ripple * noise * torch.randn(
+        smoothed.shape, generator=torch.Generator().manual_seed(seed)
+    )
     found = limited(u, smoothed, sd)
     assert float(found[..., 5:15].max()) <= float(smoothed.max()) + 1e-4
     assert float(found[..., 5:15].min()) >= float(smoothed.min()) - 1e-4
-    torch.testing.assert_close(found[..., 15:], u[..., 15:].clamp(level - 10 * noise, level + 10 * noise))
+    torch.testing.assert_close(
+        found[..., 15:], u[..., 15:].clamp(level - 10 * noise, level + 10 * noise)
+    )
     beside, kept = u[..., 5:15], found[..., 5:15]
     inner = (beside > level + 1e-3 * noise) & (beside < level + 29.999 * noise)
     torch.testing.assert_close(kept[inner], beside[inner])

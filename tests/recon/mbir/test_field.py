@@ -1,4 +1,5 @@
-"""The learned prior on whole fields: operator and noise units, blocks, grids, foreign scans from end to end."""
+"""The learned prior on whole fields: operator and noise units, blocks, grids, foreign scans from
+end to end."""
 
 import math
 
@@ -14,7 +15,8 @@ from recon.mbir.network import Network, NetworkConfig
 from recon.mbir.problem import NormalisedProblem, filtered
 from torchpcct import ConeBeam, ParallelBeam, Projector, Scan, VolumeGrid, full_turn
 
-MU, HU = 0.02, 2e-5
+MU = 0.02
+HU = 2e-5
 PARALLEL = ParallelBeam(np.arange(120) * math.pi / 120, 48, 0.5)
 SLICES = VolumeGrid((8, 48, 48), 0.5)
 CONE = ConeBeam(full_turn(90), 60.0, 100.0, 48, 16, 1.0)
@@ -26,7 +28,9 @@ def stack(photons=5e3, seed=0):
     mu = MU * (torch.hypot(y, x) < 9) + 0.2 * MU * (torch.hypot(y - 2 - 0.3 * z, x) < 1.5)
     truth = (mu - 0.6 * MU * (torch.hypot(y + 4, x - 2) < 2.5)).float()
     lines = Projector(PARALLEL, SLICES.slice)(truth)
-    counts = torch.poisson(photons * torch.exp(-lines), generator=torch.Generator().manual_seed(seed))
+    counts = torch.poisson(
+        photons * torch.exp(-lines), generator=torch.Generator().manual_seed(seed)
+    )
     return Scan.from_counts(counts, PARALLEL, air=photons, mu_water=MU), truth
 
 
@@ -36,7 +40,8 @@ def shipped():
 
 
 def test_noise_looks_the_same_everywhere_in_noise_units():
-    """β − H u has variance about that of the spectrum, in the middle and where the rays are bright."""
+    """β − H u has variance about that of the spectrum, in the middle and where the rays are
+    bright."""
     scan, truth = stack()
     problem = FieldProblem(scan, SLICES)
     slices = problem.slices(scan)
@@ -46,12 +51,16 @@ def test_noise_looks_the_same_everywhere_in_noise_units():
     u = truth / HU / (normal.scale_hu * gram.ratio)
     noise = (normal.beta - normal.apply(u[None]))[0]
     expected = float(normal.spectrum().expand(1, 8, 48, 25).mean())
-    r = torch.hypot(*torch.meshgrid(*[torch.from_numpy(a) for a in SLICES.slice.axes], indexing="ij"))
+    r = torch.hypot(
+        *torch.meshgrid(*[torch.from_numpy(a) for a in SLICES.slice.axes], indexing="ij")
+    )
     for ring in (r < 5, (r > 8.5) & (r < 11)):
         assert float(noise[:, ring].square().mean()) == pytest.approx(expected, rel=0.4)
     assert float(gram.ratio[:, r < 11].max() / gram.ratio[:, r < 11].min()) > 1.1
     v, w = torch.randn(2, 1, *SLICES.shape, generator=torch.Generator().manual_seed(1))
-    assert float((v * normal.apply(w)).sum()) == pytest.approx(float((w * normal.apply(v)).sum()), rel=1e-3)
+    assert float((v * normal.apply(w)).sum()) == pytest.approx(
+        float((w * normal.apply(v)).sum()), rel=1e-3
+    )
 
 
 def test_blocks_with_all_that_the_network_sees_are_the_whole():
@@ -68,7 +77,12 @@ def test_blocks_with_all_that_the_network_sees_are_the_whole():
 
 def test_a_stack_of_slices_is_nearer_to_the_truth_than_fbp(shipped):
     scan, truth = stack()
-    inside = torch.hypot(*torch.meshgrid(*[torch.from_numpy(a) for a in SLICES.slice.axes], indexing="ij")) < 11
+    inside = (
+        torch.hypot(
+            *torch.meshgrid(*[torch.from_numpy(a) for a in SLICES.slice.axes], indexing="ij")
+        )
+        < 11
+    )
     wanted = 1000 * (truth / MU - 1)
 
     def rmse(volume):
@@ -87,42 +101,58 @@ def starved(photons, seed=0):
     rods = torch.hypot(x.abs() - 6, y) < 2
     truth = (MU * (torch.hypot(y, x) < 11) + 60 * MU * rods).float()
     lines = Projector(PARALLEL, SLICES.slice)(truth)
-    counts = torch.poisson(photons * torch.exp(-lines), generator=torch.Generator().manual_seed(seed))
+    counts = torch.poisson(
+        photons * torch.exp(-lines), generator=torch.Generator().manual_seed(seed)
+    )
     return Scan.from_counts(counts, PARALLEL, air=photons, mu_water=MU)
 
 
 @pytest.mark.extended
 def test_a_denoiser_in_the_networks_place_is_told_the_noise_of_the_field():
-    """What it sees of two scans differs by that noise; a filter by name lowers the error without any weights."""
+    """What it sees of two scans differs by that noise; a filter by name lowers the error without
+    any weights."""
     seen = []
 
     def nothing(volume, sigma):
         seen.append((volume, sigma))
         return volume
 
-    inside = torch.hypot(*torch.meshgrid(*[torch.from_numpy(a) for a in SLICES.slice.axes], indexing="ij")) < 8
+    inside = (
+        torch.hypot(
+            *torch.meshgrid(*[torch.from_numpy(a) for a in SLICES.slice.axes], indexing="ij")
+        )
+        < 8
+    )
     volumes = [reconstruct(stack(seed=k)[0], SLICES, "mbir", prior=nothing) for k in range(2)]
     (first, sigma), (second, _) = seen
     assert float((first - second)[:, inside].std()) / math.sqrt(2) == pytest.approx(sigma, rel=0.25)
     scan, truth = stack()
     wanted = 1000 * (truth / MU - 1)
     filtered = reconstruct(scan, SLICES, "mbir:prior=perona-malik")
-    errors = [float((v.data - wanted)[:, inside].square().mean().sqrt()) for v in (volumes[0], filtered)]
+    errors = [
+        float((v.data - wanted)[:, inside].square().mean().sqrt()) for v in (volumes[0], filtered)
+    ]
     assert errors[1] < 0.7 * errors[0]
     assert filtered.report["prior"] == "perona_malik"
     assert "weights_sha256" not in filtered.report
 
 
-def test_a_step_towards_the_data_is_not_mostly_noise_where_other_rays_are_starved_than_in_the_middle():
+def test_a_step_towards_the_data_is_not_mostly_noise_where_rays_beside_the_middle_are_starved():
     scan = starved(5e4)
     problem = FieldProblem(scan, SLICES)
     slices = problem.slices(scan)
     gram = FieldGram(problem, [w for _, w in slices], 0.2)
-    noise = torch.stack([
-        problem.projector.T(w.sqrt() * torch.randn(w.shape, generator=torch.Generator().manual_seed(k)))
-        for k, (_, w) in enumerate(slices)
-    ])  # fmt: skip
-    normal = NormalisedProblem.from_statistic(gram, (gram.ratio * noise)[None], torch.ones(1), HU, 0.2)
+    noise = torch.stack(
+        [
+            problem.projector.T(
+                w.sqrt() * torch.randn(w.shape, generator=torch.Generator().manual_seed(k))
+            )
+            for k, (_, w) in enumerate(slices)
+        ]
+    )
+    normal = NormalisedProblem.from_statistic(
+        gram, (gram.ratio * noise)[None], torch.ones(1), HU, 0.2
+    )
     step = filtered(normal.beta, 1.0 / (normal.spectrum() + 0.1))[0]
     y, x = torch.meshgrid(*[torch.from_numpy(a) for a in SLICES.slice.axes], indexing="ij")
     # Noise of covariance H becomes H / (H + 0.1)², 2.5 at most, wherever H is what it is taken for.

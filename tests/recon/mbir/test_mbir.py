@@ -42,7 +42,8 @@ def test_report(clean, problem, network):
 
 
 def test_noise_free_values_in_hu(clean, problem):
-    """An untrained network adds nothing: a linear filter, means in the ball and in fat are those of FBP."""
+    """An untrained network adds nothing: a linear filter, means in the ball and in fat are those
+    of FBP."""
     plain = Mbir(Unrolled(NetworkConfig((6, 8, 8), 0.4), 2), fidelity=1.0)
     found = reconstruct(clean, GRID, "mbir", network=plain, problem=problem).data
     fbp = reconstruct(clean, GRID, "fbp", kernel="soft").data
@@ -56,18 +57,26 @@ def test_noise_map_is_the_noise(clean, problem, network):
     scans = [clean.with_noise(2.0, s) for s in range(24)]
     volumes = reconstruct(scans, GRID, "mbir", network=network, problem=problem)
     measured = torch.stack([v.data for v in volumes]).var(0).mean().sqrt()
-    estimated = network.noise_map(problem, problem.statistic(scans[0]).b, 2.0, draws=16).square().mean().sqrt()
+    estimated = (
+        network.noise_map(problem, problem.statistic(scans[0]).b, 2.0, draws=16)
+        .square()
+        .mean()
+        .sqrt()
+    )
     assert float(estimated / measured) == pytest.approx(1.0, abs=0.15)
 
 
 def test_residual_and_chi2_by_their_definitions(clean, problem, network):
-    """From the returned volume: what is left of the readings, weighed, per reading; and of their low frequencies."""
+    """From the returned volume: what is left of the readings, weighed, per reading; and of their
+    low frequencies."""
     scan = clean.with_noise(1.0, 0)
     report = (volume := reconstruct(scan, GRID, "mbir", network=network, problem=problem)).report
     x = (volume.data / 1000.0 + 1.0) * problem.mu_ref - problem.level
     y = problem.data(scan).double()
     rest = y - problem.projector(x).double()
-    assert report["chi2"] == pytest.approx(float((problem.weights * rest.square()).sum() / y.numel()), rel=2e-3)
+    assert report["chi2"] == pytest.approx(
+        float((problem.weights * rest.square()).sum() / y.numel()), rel=2e-3
+    )
     normal = network.problem(problem, problem.statistic(scan).b[None], 1.0)
     u = x[None] * 1000.0 / problem.mu_ref / normal.scale_hu
     expected = float(low_residual(normal, normal.beta - normal.apply(u), network.fidelity))
@@ -77,14 +86,17 @@ def test_residual_and_chi2_by_their_definitions(clean, problem, network):
 def test_fidelity(clean, problem, network):
     """By name or with the network; more of it, more of the data's noise; out of range: refused."""
     scan = clean.with_noise(1.0, 0)
-    bare = Mbir(network.model, restore=False)  # what such a network takes away is much, and would come back
+    # what such a network takes away is much, and would come back
+    bare = Mbir(network.model, restore=False)
     quiet, middle, sharp = (
         reconstruct(scan, GRID, "mbir", network=bare, problem=problem, fidelity=fidelity)
         for fidelity in (0.0, 0.5, 1.0)
     )
     assert [v.report["fidelity"] for v in (quiet, middle, sharp)] == [0.0, 0.5, 1.0]
     assert float(quiet.data.std()) < float(middle.data.std()) < float(sharp.data.std())
-    kept = reconstruct(scan, GRID, "mbir", network=Mbir(network.model, 1.0, restore=False), problem=problem)
+    kept = reconstruct(
+        scan, GRID, "mbir", network=Mbir(network.model, 1.0, restore=False), problem=problem
+    )
     assert torch.equal(kept.data, sharp.data)
     with pytest.raises(ValueError, match="fidelity"):
         reconstruct(scan, GRID, "mbir", network=network, problem=problem, fidelity=1.5)
@@ -102,7 +114,9 @@ def test_wrong_exposure_is_noticed(clean, problem, network, caplog):
 def test_unseen_dose_is_noticed(clean, problem, network):
     model = Unrolled(network.model.network.config, 2)
     model.seen_scale_hu = torch.tensor([50.0, 60.0])
-    volume = reconstruct(clean.with_noise(0.01, 0), GRID, "mbir", network=Mbir(model), problem=problem)
+    volume = reconstruct(
+        clean.with_noise(0.01, 0), GRID, "mbir", network=Mbir(model), problem=problem
+    )
     assert any("outside of the 50…60 HU" in text for text in volume.report["warnings"])
 
 
@@ -113,7 +127,9 @@ def test_other_voxels_are_averages_of_the_working_grid(clean, network):
     scan = clean.with_noise(4.0, 0)
     whole = reconstruct(scan, fine, "mbir", network=network).data
     averaged = whole.reshape(4, 2, 9, 2, 9, 2).mean(dim=(1, 3, 5))
-    torch.testing.assert_close(reconstruct(scan, coarse, "mbir", network=network).data, averaged, rtol=1e-4, atol=0.02)
+    torch.testing.assert_close(
+        reconstruct(scan, coarse, "mbir", network=network).data, averaged, rtol=1e-4, atol=0.02
+    )
 
 
 @pytest.mark.parametrize("voxel", [0.2, 0.25, 0.3, 0.4])
@@ -125,14 +141,24 @@ def test_averages_keep_a_ramp(voxel):
     z, y, x = np.meshgrid(*target.axes, indexing="ij")
     expected = 1.0 + 2 * z - y + 3 * x
     inner = (slice(1, -1),) * 3
-    np.testing.assert_allclose(average_onto(ramp, source, target).numpy()[inner], expected[inner], atol=0.35 * 0.2)
+    np.testing.assert_allclose(
+        average_onto(ramp, source, target).numpy()[inner], expected[inner], atol=0.35 * 0.2
+    )
 
 
 def test_refusals(clean, problem, network, tmp_path):
     with pytest.raises(ValueError, match="another grid"):
-        reconstruct(clean, VolumeGrid((4, 9, 9), 0.4, CENTER), "mbir", network=network, problem=problem)
+        reconstruct(
+            clean, VolumeGrid((4, 9, 9), 0.4, CENTER), "mbir", network=network, problem=problem
+        )
     with pytest.raises(ValueError, match="one exposure"):
-        reconstruct([clean.with_noise(t, 0) for t in (1.0, 2.0)], GRID, "mbir", network=network, problem=problem)
+        reconstruct(
+            [clean.with_noise(t, 0) for t in (1.0, 2.0)],
+            GRID,
+            "mbir",
+            network=network,
+            problem=problem,
+        )
     coarse = InsetProblem(clean, VolumeGrid((4, 9, 9), 0.8, CENTER))
     with pytest.raises(ValueError, match=r"voxels of 0\.4 mm"):
         network(coarse, torch.zeros(1, 4, 9, 9), 1.0)
@@ -145,7 +171,8 @@ def test_refusals(clean, problem, network, tmp_path):
 
 
 def test_shadow_of_dead_readings(clean, problem, network):
-    """Readings without a count give a finite volume: the logarithm is bounded, the weight is the expected one."""
+    """Readings without a count give a finite volume: the logarithm is bounded, the weight is the
+    expected one."""
     scan = clean.with_noise(0.5, 1)
     scan.counts[::10] = 0
     volume = reconstruct(scan, GRID, "mbir", network=network, problem=problem)
@@ -190,7 +217,9 @@ def always_drawn(monkeypatch):
     monkeypatch.setattr(OutlineMbir, "drawn", drawn)
 
 
-def test_a_volume_says_what_was_drawn_and_what_that_changed(clean, problem, network, always_drawn, tmp_path):
+def test_a_volume_says_what_was_drawn_and_what_that_changed(
+    clean, problem, network, always_drawn, tmp_path
+):
     scan = clean.with_noise(2.0, 1)
     given = {"network": network, "problem": problem}
     plain = reconstruct(scan, GRID, "mbir", **given)

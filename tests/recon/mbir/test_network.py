@@ -52,17 +52,22 @@ def test_condition_counts(network, which):
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (5, 7, 9), (8, 8, 8), (1, 13, 20)])
 def test_any_shape_is_padded_with_background(network, shape):
-    """What lies beyond the grid is 0, so a volume in a larger one of zeros gives the same as alone, but at the rim."""
+    """What lies beyond the grid is 0, so a volume in a larger one of zeros gives the same as
+    alone, but at the rim."""
     u, towards = volumes((2, *shape))
     found = network(u, towards, CONDITION)
     assert found.shape == u.shape
-    padded = [torch.nn.functional.pad(v, (0, -shape[2] % 8, 0, -shape[1] % 8, 0, -shape[0] % 8)) for v in (u, towards)]
+    padded = [
+        torch.nn.functional.pad(v, (0, -shape[2] % 8, 0, -shape[1] % 8, 0, -shape[0] % 8))
+        for v in (u, towards)
+    ]
     whole = network(*padded, CONDITION)[:, : shape[0], : shape[1], : shape[2]]
     torch.testing.assert_close(found, whole)
 
 
 def test_shifted_volumes_give_shifted_results(network):
-    """By whole cells of the coarsest level, away from the rim: nothing depends on where a voxel lies."""
+    """By whole cells of the coarsest level, away from the rim: nothing depends on where a voxel
+    lies."""
     u, towards = volumes((2, 128, 8, 8))
     for v in (u, towards):
         v[:, :56], v[:, 64:] = 0.0, 0.0
@@ -127,12 +132,15 @@ def test_relative_to_the_local_mean_a_constant_passes_through(network):
 
 
 def test_local_mean_by_hand():
-    """Weights of a Gaussian over the voxels that there are; a volume of one voxel is its own mean."""
+    """Weights of a Gaussian over the voxels that there are; a volume of one voxel is its own
+    mean."""
     v = torch.zeros(1, 1, 1, 5, dtype=torch.float64)
     v[..., 0] = 1.0
     weights = torch.exp(-0.5 * (torch.arange(5, dtype=torch.float64) / 2.0) ** 2)
     assert float(local_mean(v, 2.0)[..., 0]) == pytest.approx(float(1.0 / weights.sum()))
-    torch.testing.assert_close(local_mean(torch.full((1, 3, 4, 5), 2.5), 3.0), torch.full((1, 3, 4, 5), 2.5))
+    torch.testing.assert_close(
+        local_mean(torch.full((1, 3, 4, 5), 2.5), 3.0), torch.full((1, 3, 4, 5), 2.5)
+    )
     assert float(local_mean(torch.ones(1, 1, 1, 1), 8.0)) == 1.0
 
 
@@ -146,9 +154,13 @@ def test_a_turned_scene_gives_the_turned_volume(network, quarters, mirrored, mea
         return torch.rot90(v.flip(-2) if mirrored else v, quarters, (-2, -1))
 
     found = symmetric(turned(u), turned(towards), CONDITION)
-    torch.testing.assert_close(found, turned(symmetric(u, towards, CONDITION)), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(
+        found, turned(symmetric(u, towards, CONDITION)), rtol=1e-5, atol=1e-6
+    )
     if quarters or mirrored:
-        alone = network(turned(u), turned(towards), CONDITION) - turned(network(u, towards, CONDITION))
+        alone = network(turned(u), turned(towards), CONDITION) - turned(
+            network(u, towards, CONDITION)
+        )
         assert float(alone.abs().max()) > 1e-3
 
 

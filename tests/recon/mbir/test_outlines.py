@@ -1,4 +1,5 @@
-"""MBIR around the outlines of a vessel: sharper where they fit, the plain reconstruction where they do not."""
+"""MBIR around the outlines of a vessel: sharper where they fit, the plain reconstruction where
+they do not."""
 
 import drawn_vessel
 import numpy as np
@@ -28,7 +29,8 @@ def test_outlines_are_sharper_and_the_layer_keeps_what_the_data_show(drawn, netw
     found = OutlineMbir(network).solved(drawn, vessel, EXPOSURE_S)
     assert found.notes[0]["vessel"]["drawn"]
     plain, around = (
-        network.in_hu(drawn, s.u, s.normal)[0].detach() for s in (network.solved(drawn, vessel, EXPOSURE_S), found)
+        network.in_hu(drawn, s.u, s.normal)[0].detach()
+        for s in (network.solved(drawn, vessel, EXPOSURE_S), found)
     )
     inside = truth > -80
     error = [float((v - truth)[inside].square().mean().sqrt()) for v in (plain, around)]
@@ -50,7 +52,9 @@ def test_outlines_that_leave_something_unexplained_are_not_drawn(drawn, network)
     """A second bright thing at the vessel's wall."""
     image = drawn_vessel.image(drawn.gram.finer, 100.0, samples=3)
     bright = torch.nonzero(image > image.max() - 50.0).double().mean(0)
-    z, y, x = (torch.arange(n)[(slice(None),) + (None,) * (2 - k)] for k, n in enumerate(image.shape))
+    z, y, x = (
+        torch.arange(n)[(slice(None),) + (None,) * (2 - k)] for k, n in enumerate(image.shape)
+    )
     near = (z - bright[0]) ** 2 + (y - bright[1] - 12) ** 2 + (x - bright[2]) ** 2 < 36
     b = statistic(drawn, torch.where(near, torch.tensor(900.0), image), 3)
     found = OutlineMbir(network).solved(drawn, b, EXPOSURE_S)
@@ -59,7 +63,8 @@ def test_outlines_that_leave_something_unexplained_are_not_drawn(drawn, network)
 
 
 def test_what_lies_apart_from_a_vessel_does_not_speak_against_it(drawn, network):
-    """Muscle 1.2 mm from the wall: the network reconstructs it, the vessel is drawn all the same."""
+    """Muscle 1.2 mm from the wall: the network reconstructs it, the vessel is drawn all the
+    same."""
     image = drawn_vessel.image(drawn.gram.finer, 100.0, samples=3)
     z, y = (torch.from_numpy(drawn.gram.finer.axes[k] - drawn.gram.finer.center[k]) for k in (0, 1))
     wall = drawn_vessel.INNER_MM + drawn_vessel.WALL_MM
@@ -77,7 +82,8 @@ def test_what_lies_apart_from_a_vessel_does_not_speak_against_it(drawn, network)
     ("values", "tissue"), [({"wall": -65.0, "fibrous": -60.0}, "wall"), ({"fibrous": 330.0}, "fib")]
 )
 def test_a_vessel_of_what_is_no_tissue_is_not_drawn(drawn, network, values, tissue):
-    """Inflamed fat about a lumen, contrast agent beside a flap: both are fitted, and explain the data."""
+    """Inflamed fat about a lumen, contrast agent beside a flap: both are fitted, and explain the
+    data."""
     b = statistic(drawn, drawn_vessel.image(drawn.gram.finer, 0.0, samples=3, **values), 4)
     found = OutlineMbir(network).solved(drawn, b, EXPOSURE_S)
     assert f"its {tissue}" in found.notes[0]["vessel"]["why"]
@@ -93,7 +99,9 @@ def test_scenes_of_a_batch_are_what_they_are_alone(drawn, network, vessel):
     assert [n["vessel"]["drawn"] for n in both.notes] == [False, True]
     assert ["no vessel" in n["warnings"][0] for n in both.notes] == [True, False]
     assert "may be missing: compare" in both.notes[1]["warnings"][0]
-    assert torch.equal(method.plain(drawn, vessel, EXPOSURE_S).u, network.solved(drawn, vessel, EXPOSURE_S).u)
+    assert torch.equal(
+        method.plain(drawn, vessel, EXPOSURE_S).u, network.solved(drawn, vessel, EXPOSURE_S).u
+    )
 
 
 def test_it_is_differentiable_with_the_fit(drawn, network, vessel):
@@ -105,7 +113,8 @@ def test_it_is_differentiable_with_the_fit(drawn, network, vessel):
     (method(drawn, b, EXPOSURE_S) * weights).sum().backward()
     with torch.no_grad():
         there = [
-            (method(drawn, vessel + s * direction, EXPOSURE_S) * weights).sum(dtype=torch.float64) for s in (0.5, -0.5)
+            (method(drawn, vessel + s * direction, EXPOSURE_S) * weights).sum(dtype=torch.float64)
+            for s in (0.5, -0.5)
         ]
     assert float((b.grad * direction).sum()) == pytest.approx(float(there[0] - there[1]), rel=0.06)
 
@@ -139,11 +148,16 @@ def test_what_is_believed_of_the_vessel_reaches_the_fit(drawn, network, vessel, 
 
 
 def test_all_values_moved_move_the_volume(drawn, network, vessel):
-    """The zero of the scanner is 150 HU off: so is the volume, whose outlines do not ask where it lies."""
-    moved = vessel + EXPOSURE_S * drawn.gram.apply(torch.full_like(vessel, 150.0 * drawn.mu_ref / 1000.0))
+    """The zero of the scanner is 150 HU off: so is the volume, whose outlines do not ask where
+    it lies."""
+    moved = vessel + EXPOSURE_S * drawn.gram.apply(
+        torch.full_like(vessel, 150.0 * drawn.mu_ref / 1000.0)
+    )
     changes = []
     for believed in (None, VesselPrior()):
-        found = [OutlineMbir(network, believed).solved(drawn, b, EXPOSURE_S) for b in (vessel, moved)]
+        found = [
+            OutlineMbir(network, believed).solved(drawn, b, EXPOSURE_S) for b in (vessel, moved)
+        ]
         assert all(f.notes[0]["vessel"]["drawn"] for f in found)
         still, other = (network.in_hu(drawn, f.u, f.normal)[0].detach() for f in found)
         changes.append(float((other - still - 150.0)[still > -40].square().mean().sqrt()))

@@ -1,4 +1,5 @@
-"""The prior is a seam: networks, filters and denoisers of a user's own between the same data steps."""
+"""The prior is a seam: networks, filters and denoisers of a user's own between the same data
+steps."""
 
 import sys
 from functools import partial
@@ -23,7 +24,8 @@ from recon.mbir.unrolled import Unrolled, first_views, guide_noise
 from recon.mbir.weights_io import write_tensors
 from torchpcct import Volume, VolumeGrid
 
-SHAPE, VOXEL = (8, 12, 12), 0.4
+SHAPE = (8, 12, 12)
+VOXEL = 0.4
 OURS = """
 import torch
 from torch import nn
@@ -53,7 +55,9 @@ def normal():
     """A small noisy problem of two scans at 0.4 mm, in noise units."""
     A, w = problem(shape=SHAPE, rows=10)
     gram = Gram(A, w, nodes=1)
-    b = gram.apply(tissue(A.grid))[None] + gram.noise((2,), generator=torch.Generator().manual_seed(0))
+    b = gram.apply(tissue(A.grid))[None] + gram.noise(
+        (2,), generator=torch.Generator().manual_seed(0)
+    )
     return NormalisedProblem.from_statistic(gram, b, torch.ones(2), HU, VOXEL)
 
 
@@ -71,14 +75,18 @@ def half(estimate, towards, condition, smoothed):
     return 0.5 * towards + 0.25 * smoothed + 0.0 * estimate
 
 
-# --- any module or function between the data steps ----------------------------------------------------------------
+# --- any module or function between the data steps ------------------------------------------------
 
 
 def test_a_prior_is_any_module_or_function_of_the_four_tensors(normal):
     """It gets what the package's network gets, and what it returns goes on."""
     torch.manual_seed(0)
     own = Unrolled(NetworkConfig((6, 8, 8), VOXEL, bilateral=True), 2).eval()
-    for prior in (own.network, lambda *given: own.network(*given), partial(own.network, mirrored=True)):
+    for prior in (
+        own.network,
+        lambda *given: own.network(*given),
+        partial(own.network, mirrored=True),
+    ):
         same = Unrolled(prior, 2, voxel_mm=VOXEL).eval()
         assert same.voxel_mm == VOXEL
         assert same.bilateral
@@ -90,10 +98,14 @@ def test_a_prior_is_any_module_or_function_of_the_four_tensors(normal):
         return half(estimate, towards, condition, smoothed)
 
     found = Unrolled(prior, 1, voxel_mm=VOXEL).eval()(normal, 0.7)
-    for given, expected in zip((seen[0][0], seen[0][1], seen[0][3]), first_views(normal, True), strict=True):
+    for given, expected in zip(
+        (seen[0][0], seen[0][1], seen[0][3]), first_views(normal, True), strict=True
+    ):
         assert torch.equal(given, expected)
     level = torch.log(normal.scale_hu / 200.0)
-    torch.testing.assert_close(seen[0][2], torch.stack([level, torch.full((2,), 0.2), torch.zeros(2)], 1))
+    torch.testing.assert_close(
+        seen[0][2], torch.stack([level, torch.full((2,), 0.2), torch.zeros(2)], 1)
+    )
     assert torch.equal(found, Unrolled(half, 1).eval()(normal, 0.7))
 
     def blind(estimate, towards, condition, smoothed):
@@ -115,10 +127,19 @@ def test_a_module_of_a_users_own_is_part_of_the_model(nets):
 @pytest.mark.parametrize(
     ("prior", "text"),
     [
-        (lambda e, t, c, s: t[:, 1:], r"the prior <lambda> returned the shape \(2, 7, 12, 12\) for \(2, 8, 12, 12\)"),
-        (lambda e, t, c, s: t.double(), r"returned torch\.float64 on cpu for torch\.float32 on cpu"),
+        (
+            lambda e, t, c, s: t[:, 1:],
+            r"the prior <lambda> returned the shape \(2, 7, 12, 12\) for \(2, 8, 12, 12\)",
+        ),
+        (
+            lambda e, t, c, s: t.double(),
+            r"returned torch\.float64 on cpu for torch\.float32 on cpu",
+        ),
         (lambda e, t, c, s: t.numpy(), "returned ndarray: it must return a tensor"),
-        (lambda volume: volume[1:], r"the prior <lambda> returned the shape \(7, 12, 12\) for \(8, 12, 12\)"),
+        (
+            lambda volume: volume[1:],
+            r"the prior <lambda> returned the shape \(7, 12, 12\) for \(8, 12, 12\)",
+        ),
         (lambda volume, sigma: volume.double(), r"float64 on cpu for torch\.float32"),
         (lambda volume: volume.numpy(), "returned ndarray"),
     ],
@@ -135,7 +156,10 @@ def test_nan_of_a_prior_is_named(clean, problem):
     scan = clean.with_noise(2.0, 0)
     model = Mbir(Unrolled(spoilt, voxel_mm=VOXEL))
     for network in (model, Mbir(Unrolled(half, voxel_mm=VOXEL), prior=spoilt)):
-        with pytest.raises(ValueError, match=rf"the prior spoilt returned NaN .* in {8 * 18} of {8 * 18 * 18} voxels"):
+        with pytest.raises(
+            ValueError,
+            match=rf"the prior spoilt returned NaN .* in {8 * 18} of {8 * 18 * 18} voxels",
+        ):
             reconstruct(scan, GRID, "mbir", network=network, problem=problem)
 
 
@@ -144,7 +168,10 @@ def test_nan_of_a_prior_is_named(clean, problem):
     [
         (nn.Identity, "got the class Identity: make one"),
         (3, "must be a function, a module or a name, got int"),
-        (lambda a, b, c: a, r"a denoiser \(volume\) or \(volume, sigma\): <lambda> takes \(a, b, c\)"),
+        (
+            lambda a, b, c: a,
+            r"a denoiser \(volume\) or \(volume, sigma\): <lambda> takes \(a, b, c\)",
+        ),
         ("perona", r"unknown prior of mbir 'perona': use one of .*did you mean"),
         ("no.such.module:run", "cannot load 'no.such.module:run': No module named"),
         ("json:nothing", "cannot load 'json:nothing': module 'json' has no attribute"),
@@ -159,15 +186,20 @@ def test_what_is_no_prior_is_named(given, text):
 
 def test_blocks_of_a_field_are_checked_one_by_one():
     v, told = torch.zeros(1, 8, 8, 24), torch.zeros(1, 3)
-    with pytest.raises(ValueError, match=r"the prior <lambda> returned the shape .* one value for each voxel"):
-        blockwise(lambda e, t, c, s: t[..., :1], torch.ones(8, 8, 24), v, v, told, None, block=8, halo=0)
+    with pytest.raises(
+        ValueError, match=r"the prior <lambda> returned the shape .* one value for each voxel"
+    ):
+        blockwise(
+            lambda e, t, c, s: t[..., :1], torch.ones(8, 8, 24), v, v, told, None, block=8, halo=0
+        )
 
 
-# --- denoisers ----------------------------------------------------------------------------------------------------
+# --- denoisers ------------------------------------------------------------------------------------
 
 
 def test_a_denoiser_sees_hu_and_is_told_the_noise_of_what_it_sees(normal):
-    """sigma is the standard deviation of a voxel over draws of the noise; filters get that of the smoothed volume."""
+    """sigma is the standard deviation of a voxel over draws of the noise; filters get that of
+    the smoothed volume."""
     seen = []
 
     def denoise(volume, sigma):
@@ -183,10 +215,14 @@ def test_a_denoiser_sees_hu_and_is_told_the_noise_of_what_it_sees(normal):
     assert seen[0][1] == pytest.approx(float((volumes + 90.0).square().mean().sqrt()), rel=0.04)
     assert float(volumes.mean()) == pytest.approx(-90.0, abs=0.1 * seen[0][1])
     scales = draws.scale_hu.reshape(-1, 1, 1, 1)
-    torch.testing.assert_close((volumes + 90.0) / scales, first_views(draws, False)[1], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(
+        (volumes + 90.0) / scales, first_views(draws, False)[1], rtol=1e-4, atol=1e-4
+    )
     spectrum = normal.spectrum()
     assert PlugAndPlay(perona_malik).smoothed_by == 0.7
-    assert (guide_noise(spectrum, SHAPE, VOXEL, 0.7) < guide_noise(spectrum, SHAPE, VOXEL, 0.0)).all()
+    assert (
+        guide_noise(spectrum, SHAPE, VOXEL, 0.7) < guide_noise(spectrum, SHAPE, VOXEL, 0.0)
+    ).all()
 
 
 def test_filters_by_name_and_functions_of_the_volume_alone(normal):
@@ -195,18 +231,28 @@ def test_filters_by_name_and_functions_of_the_volume_alone(normal):
     assert torch.equal(by_name, itself)
     assert prior_of("perona_malik").denoiser is perona_malik
     assert prior_of("bilateral") is bilateral_prior
-    assert [name_of(prior_of(p)) for p in ("nlm", bilateral_prior, half)] == ["nlm", "bilateral_prior", "half"]
+    assert [name_of(prior_of(p)) for p in ("nlm", bilateral_prior, half)] == [
+        "nlm",
+        "bilateral_prior",
+        "half",
+    ]
     # Nothing taken away: what the prior returns is the step towards the data.
     step = first_views(normal, True)[1]
-    free = model(normal, prior=prior_of(lambda volume: volume), final_data_consistency=False, cut_overshoot=False,
-                 restore=False)  # fmt: skip
+    free = model(
+        normal,
+        prior=prior_of(lambda volume: volume),
+        final_data_consistency=False,
+        cut_overshoot=False,
+        restore=False,
+    )
     torch.testing.assert_close(free, step, rtol=1e-4, atol=1e-4)
     assert prior_of(model.network) is model.network
 
 
 @pytest.mark.parametrize("kind", [nn.Conv2d, nn.Conv3d])
 def test_denoisers_of_deepinv_are_known_by_their_module(kind):
-    """They see images with batch and channel whose values are about 1: slices, or volumes if they convolve in 3-D."""
+    """They see images with batch and channel whose values are about 1: slices, or volumes if
+    they convolve in 3-D."""
     seen = []
 
     class Denoiser(nn.Module):
@@ -229,7 +275,8 @@ def test_denoisers_of_deepinv_are_known_by_their_module(kind):
 
 
 def test_a_filter_knows_any_noise_and_says_that_it_is_the_prior(clean, problem):
-    """No weights take part: nothing is said of a training, and the report names the prior in their place."""
+    """No weights take part: nothing is said of a training, and the report names the prior in
+    their place."""
     scan = clean.with_noise(0.2, 0)
     network = Mbir(Unrolled(half, voxel_mm=VOXEL), prior="nlm")
     volume = reconstruct(scan, GRID, "mbir", network=network, problem=problem)
@@ -239,19 +286,29 @@ def test_a_filter_knows_any_noise_and_says_that_it_is_the_prior(clean, problem):
     assert network.check([1e4], 3000.0) == [
         "the volume reaches 3000 HU, more than 2000 HU: metal shades the tissue beside it"
     ]
-    other = reconstruct(scan, GRID, "mbir", network=Mbir(Unrolled(half, voxel_mm=VOXEL)), prior="nlm", problem=problem)
+    other = reconstruct(
+        scan,
+        GRID,
+        "mbir",
+        network=Mbir(Unrolled(half, voxel_mm=VOXEL)),
+        prior="nlm",
+        problem=problem,
+    )
     assert torch.equal(other.data, volume.data)
     assert OutlineMbir(network).prior_name == "nlm"
 
 
-# --- weights of another network -----------------------------------------------------------------------------------
+# --- weights of another network -------------------------------------------------------------------
 
 
 @pytest.fixture
 def saved(nets, tmp_path):
-    """A file with weights of a user's own network, and the model; its module is not imported any more."""
+    """A file with weights of a user's own network, and the model; its module is not imported any
+    more."""
     torch.manual_seed(0)
-    model = Unrolled(network_of({"class": f"{nets}:MyNet", "width": 4}, f"{nets}:MyNet"), 1, voxel_mm=VOXEL)
+    model = Unrolled(
+        network_of({"class": f"{nets}:MyNet", "width": 4}, f"{nets}:MyNet"), 1, voxel_mm=VOXEL
+    )
     model.seen_scale_hu = torch.tensor([10.0, 2000.0])
     header = {"network": {"class": f"{nets}:MyNet", "width": 4}, "unroll": 1, "voxel_mm": VOXEL}
     write_tensors(tmp_path / "w.safetensors", WEIGHTS_FORMAT, model.state_dict(), header)
@@ -261,7 +318,9 @@ def saved(nets, tmp_path):
 
 def test_a_file_alone_imports_nothing(saved, nets):
     path, model = saved
-    with pytest.raises(ValueError, match=rf"of a class of its own, {nets}:MyNet, .*--network {nets}:MyNet"):
+    with pytest.raises(
+        ValueError, match=rf"of a class of its own, {nets}:MyNet, .*--network {nets}:MyNet"
+    ):
         Mbir.load(path)
     assert nets not in sys.modules
     with pytest.raises(ValueError, match=r"^(?!.*(new installation|holds no weights))"):
@@ -276,7 +335,10 @@ def test_a_file_alone_imports_nothing(saved, nets):
 
 def test_weights_of_another_class_are_named(saved, nets):
     path, _ = saved
-    wider = r"they do not fit Wider: network\.inner\.weight has the shape \(4, 2, 3, 3, 3\) in the file, \(5, 2"
+    wider = (
+        r"they do not fit Wider: network\.inner\.weight has the shape \(4, 2, 3, 3, 3\) in "
+        r"the file, \(5, 2"
+    )
     for network, text in (
         (f"{nets}:Wider", wider),
         (f"{nets}:denoise", "denoise cannot be made with width=4"),
@@ -289,7 +351,7 @@ def test_weights_of_another_class_are_named(saved, nets):
         Mbir.load(network=f"{nets}:MyNet")
 
 
-# --- names of methods ---------------------------------------------------------------------------------------------
+# --- names of methods -----------------------------------------------------------------------------
 
 
 def test_priors_in_the_name_of_a_method(saved, nets):
@@ -303,7 +365,10 @@ def test_priors_in_the_name_of_a_method(saved, nets):
     assert trained.network.model.voxel_mm == VOXEL
     for bad, text in (
         (f"mbir:network={nets}:MyNet", "give it with weights=FILE"),
-        (f"mbir:weights={path},network=MyNet", "network of mbir must be package.module:Class, got 'MyNet'"),
+        (
+            f"mbir:weights={path},network=MyNet",
+            "network of mbir must be package.module:Class, got 'MyNet'",
+        ),
         (f"mbir:weights={path}", "no file alone may import"),
         ("mbir:prior=tw", "unknown prior of mbir 'tw'"),
     ):
@@ -312,7 +377,8 @@ def test_priors_in_the_name_of_a_method(saved, nets):
 
 
 def test_the_library_and_the_command_take_the_same_names(clean, nets, here, cli):
-    """``mbir:prior=…`` in recon.reconstruct and in torchpcct reconstruct: the same volume, the user's module here."""
+    """``mbir:prior=…`` in recon.reconstruct and in torchpcct reconstruct: the same volume, the
+    user's module here."""
     scan, grid = clean.with_noise(2.0, 0), VolumeGrid((4, 9, 9), 0.4, GRID.center)
     scan.save("scan.h5")
     spec = f"mbir:fidelity=1,prior={nets}:denoise"
@@ -320,16 +386,29 @@ def test_the_library_and_the_command_take_the_same_names(clean, nets, here, cli)
     assert found.report["prior"] == "denoise"
     assert found.report["fidelity"] == 1.0
     center, extent = (" ".join(f"{v:g}" for v in values) for values in (grid.center, grid.extent))
-    said = cli(f"reconstruct scan.h5 --method {spec} --voxel 0.4 --center {center} --extent {extent} --json")
+    said = cli(
+        f"reconstruct scan.h5 --method {spec} --voxel 0.4 --center {center} --extent {extent} "
+        "--json"
+    )
     assert '"prior": "denoise"' in said
-    torch.testing.assert_close(Volume.load(here / "scan_mbir.nii.gz").data, found.data, rtol=1e-5, atol=1e-3)
-    assert torch.equal(reconstruct(clean, grid, "fbp:soft").data, reconstruct(clean, grid, "fbp", kernel="soft").data)
-    with pytest.raises(TypeError, match=r"fidelity stands in the method 'mbir:fidelity=1,.* and beside it"):
+    torch.testing.assert_close(
+        Volume.load(here / "scan_mbir.nii.gz").data, found.data, rtol=1e-5, atol=1e-3
+    )
+    assert torch.equal(
+        reconstruct(clean, grid, "fbp:soft").data,
+        reconstruct(clean, grid, "fbp", kernel="soft").data,
+    )
+    with pytest.raises(
+        TypeError, match=r"fidelity stands in the method 'mbir:fidelity=1,.* and beside it"
+    ):
         reconstruct(scan, grid, spec, fidelity=0.5)
     for words, text in (
         (f"--method {spec} --fidelity 1", "--fidelity stands in --method"),
         (f"--method mbir --network {nets}:MyNet", "give it with --weights FILE"),
-        (f"--method mbir --network {nets} --weights scan.h5", "--network must be package.module:Class"),
+        (
+            f"--method mbir --network {nets} --weights scan.h5",
+            "--network must be package.module:Class",
+        ),
         ("--method mbir:prior=tw", "unknown prior of mbir 'tw'"),
         ("--method pwls:soft", "pwls has no options"),
     ):

@@ -1,4 +1,5 @@
-"""What a reconstruction has left in the data: noise stays out, patterns too weak to be seen are found."""
+"""What a reconstruction has left in the data: noise stays out, patterns too weak to be seen are
+found."""
 
 import math
 
@@ -21,7 +22,8 @@ def gram():
 
 
 def left(gram, x, noise, batch=1):
-    """Normalised problem of an image in HU with noise, ``(batch, z, y, x)``; nothing of it is reconstructed yet."""
+    """Normalised problem of an image in HU with noise, ``(batch, z, y, x)``; nothing of it is
+    reconstructed yet."""
     generator = torch.Generator().manual_seed(3)
     b = gram.apply(x * HU) + noise * gram.noise((batch,), generator=generator)
     return NormalisedProblem.from_statistic(gram, b, torch.ones(batch), HU, 0.4)
@@ -103,7 +105,10 @@ def test_it_is_differentiable(gram):
     p = left(gram, bars(SHAPE, 80.0), 1.0)
     beta = p.beta.clone().requires_grad_(True)
     v = significant_residual(
-        NormalisedProblem(gram, beta, p.scale_hu, p.factor, 0.4), p.spectrum(), torch.zeros_like(beta), DAMPING
+        NormalisedProblem(gram, beta, p.scale_hu, p.factor, 0.4),
+        p.spectrum(),
+        torch.zeros_like(beta),
+        DAMPING,
     )
     v.sum().backward()
     step = torch.randn(beta.shape, generator=torch.Generator().manual_seed(0))

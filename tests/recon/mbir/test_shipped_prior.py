@@ -1,6 +1,8 @@
-"""What the shipped weights must be worth: beside FBP of the same readings, beside their own linear start, part by part.
+"""What the shipped weights must be worth: beside FBP of the same readings, beside their own linear
+start, part by part.
 
-A tilted vessel with a core (not the paper's), painted on 0.1 mm, projected and drawn at two noise levels.
+A tilted vessel with a core (not the paper's), painted on 0.1 mm, projected and drawn at two noise
+levels.
 """
 
 import math
@@ -21,7 +23,14 @@ from recon.mbir.mbir import Mbir
 from recon.mbir.network import NetworkConfig
 from recon.mbir.problem import filtered
 from recon.mbir.residual import significant_residual
-from recon.mbir.unrolled import REFERENCE_SCALE_HU, Unrolled, guide_noise, limited, low_residual, start
+from recon.mbir.unrolled import (
+    REFERENCE_SCALE_HU,
+    Unrolled,
+    guide_noise,
+    limited,
+    low_residual,
+    start,
+)
 
 FAT = drawn_vessel.VALUES["fat"]
 LEVEL = 1.0 + FAT / 1000.0
@@ -42,9 +51,17 @@ def drawn():
     inner[RIM:-RIM, RIM:-RIM, RIM:-RIM] = True
     vessel = truth > FAT + 10.0
     apart = torch.from_numpy(ndimage.distance_transform_edt(~vessel.numpy(), sampling=0.2)) > 0.6
-    scan = SimpleNamespace(gram=Gram(A, w, 5), grid=A.grid, mu_ref=1000.0 * HU, level=1000.0 * LEVEL * HU)
-    return SimpleNamespace(A=A, w=w, truth=truth, readings=readings, scan=scan,
-                           places={"vessel": vessel & inner, "fat": apart & inner})  # fmt: skip
+    scan = SimpleNamespace(
+        gram=Gram(A, w, 5), grid=A.grid, mu_ref=1000.0 * HU, level=1000.0 * LEVEL * HU
+    )
+    return SimpleNamespace(
+        A=A,
+        w=w,
+        truth=truth,
+        readings=readings,
+        scan=scan,
+        places={"vessel": vessel & inner, "fat": apart & inner},
+    )
 
 
 @pytest.fixture(scope="module", params=[40.0, 8.0], ids=["152 HU", "341 HU"])
@@ -54,20 +71,36 @@ def found(drawn, request):
     noise = torch.randn((2, *drawn.readings.shape), generator=generator)
     y = drawn.readings + noise / (drawn.w * exposure).sqrt()
     b, network = drawn.A.T(drawn.w * exposure * y), Mbir.load()
-    kernels = filter_sinogram(y, drawn.A.geometry, ["soft", "standard"], drawn.A.window, held=drawn.A.window)
-    soft, standard = backproject(kernels, drawn.A.geometry, drawn.A.grid, drawn.A.window) / HU - 1000.0 * (1.0 - LEVEL)
+    kernels = filter_sinogram(
+        y, drawn.A.geometry, ["soft", "standard"], drawn.A.window, held=drawn.A.window
+    )
+    soft, standard = backproject(
+        kernels, drawn.A.geometry, drawn.A.grid, drawn.A.window
+    ) / HU - 1000.0 * (1.0 - LEVEL)
     with torch.no_grad():
-        volumes = {"soft": soft, "standard": standard, "mbir": network(drawn.scan, b, exposure),
-                   "linear": Mbir(network.model, network.fidelity, steps=0)(drawn.scan, b, exposure)}  # fmt: skip
+        volumes = {
+            "soft": soft,
+            "standard": standard,
+            "mbir": network(drawn.scan, b, exposure),
+            "linear": Mbir(network.model, network.fidelity, steps=0)(drawn.scan, b, exposure),
+        }
         normal = network.problem(drawn.scan, b, exposure)
         free = network.model(normal, network.fidelity, final_data_consistency=False)
-    return SimpleNamespace(exposure=exposure, volumes=volumes, normal=normal, fidelity=network.fidelity, free=free,
-                           out=network.in_noise_units(drawn.scan, volumes["mbir"], normal))  # fmt: skip
+    return SimpleNamespace(
+        exposure=exposure,
+        volumes=volumes,
+        normal=normal,
+        fidelity=network.fidelity,
+        free=free,
+        out=network.in_noise_units(drawn.scan, volumes["mbir"], normal),
+    )
 
 
 def error(drawn, found, method, place):
     """Root mean square, HU."""
-    return float((found.volumes[method] - drawn.truth)[:, drawn.places[place]].square().mean().sqrt())
+    return float(
+        (found.volumes[method] - drawn.truth)[:, drawn.places[place]].square().mean().sqrt()
+    )
 
 
 def energy(normal, u):
@@ -77,9 +110,15 @@ def energy(normal, u):
 
 @pytest.mark.parametrize(
     ("place", "rival", "at_most"),
-    [("vessel", "soft", (0.87, 0.68)), ("vessel", "standard", (0.72, 0.48)), ("vessel", "linear", (0.97, 0.86)),
-     ("fat", "soft", (0.22, 0.17)), ("fat", "standard", (0.15, 0.12)), ("fat", "linear", (0.30, 0.25))],
-)  # fmt: skip
+    [
+        ("vessel", "soft", (0.87, 0.68)),
+        ("vessel", "standard", (0.72, 0.48)),
+        ("vessel", "linear", (0.97, 0.86)),
+        ("fat", "soft", (0.22, 0.17)),
+        ("fat", "standard", (0.15, 0.12)),
+        ("fat", "linear", (0.30, 0.25)),
+    ],
+)
 def test_the_error_is_that_share_of_the_rivals(drawn, found, place, rival, at_most):
     share = error(drawn, found, "mbir", place) / error(drawn, found, rival, place)
     assert share < at_most[0 if found.exposure == 40.0 else 1]
@@ -93,8 +132,10 @@ def test_fat_and_lumen_keep_their_values(drawn, found):
 
 
 def test_final_data_consistency_makes_the_network_s_volume_explain_the_data(found):
-    left = [low_residual(found.normal, found.normal.beta - found.normal.apply(u), found.fidelity).max()
-            for u in (found.free, found.out)]  # fmt: skip
+    left = [
+        low_residual(found.normal, found.normal.beta - found.normal.apply(u), found.fidelity).max()
+        for u in (found.free, found.out)
+    ]
     assert left[1] < 0.4 * left[0]
     assert energy(found.normal, found.out) < energy(found.normal, found.free)
 
@@ -122,23 +163,30 @@ def test_the_network_is_given_a_step_towards_the_data_and_where_it_is(found):
     for k, (u, towards, condition) in enumerate(model.network.seen):
         torch.testing.assert_close(u, before)
         left = normal.beta - normal.apply(u)
-        torch.testing.assert_close(towards - u, filtered(left, 1.0 / (spectrum + 0.1)), rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(
+            towards - u, filtered(left, 1.0 / (spectrum + 0.1)), rtol=1e-3, atol=1e-3
+        )
         assert energy(normal, towards) < energy(normal, u)
         level = torch.log(normal.scale_hu / REFERENCE_SCALE_HU)
-        torch.testing.assert_close(condition, torch.stack([level, 0.25 + 0 * level, k + 0 * level], 1))
+        torch.testing.assert_close(
+            condition, torch.stack([level, 0.25 + 0 * level, k + 0 * level], 1)
+        )
         before = 0.9 * u
 
 
 @pytest.fixture(scope="module")
 def striped(drawn):
-    """The shipped network, a problem that holds fine stripes beyond all noise, the volumes of its steps, and what the
-    network alone, with the data, without overshoot, and with what the data still hold makes of it."""
+    """The shipped network, a problem that holds fine stripes beyond all noise, the volumes of its
+    steps, and what the network alone, with the data, without overshoot, and with what the data
+    still hold makes of it."""
     network, exposure, generator = Mbir.load(), 40.0, torch.Generator().manual_seed(0)
     noise = torch.randn(drawn.readings.shape, generator=generator)
     y = drawn.readings + noise / (drawn.w * exposure).sqrt()
     normal = network.problem(drawn.scan, drawn.A.T(drawn.w * exposure * y)[None], exposure)
     stripes = 8.0 * torch.sin(2.0 * math.pi * torch.arange(normal.beta.shape[-1]) / 5.0)
-    normal = replace(normal, beta=normal.beta + normal.apply(stripes.expand(normal.beta.shape).contiguous()))
+    normal = replace(
+        normal, beta=normal.beta + normal.apply(stripes.expand(normal.beta.shape).contiguous())
+    )
     steps = []
 
     def run(callback=None, **options):
@@ -146,9 +194,15 @@ def striped(drawn):
             return network.model(normal, network.fidelity, callback, **options)
 
     plain = {"cut_overshoot": False, "restore": False}
-    made = {"alone": run(lambda k, v: steps.append(v), final_data_consistency=False, **plain), "data": run(**plain),
-            "cut": run(restore=False), "all": run()}  # fmt: skip
-    return SimpleNamespace(model=network.model, normal=normal, steps=steps, run=run, plain=plain, **made)
+    made = {
+        "alone": run(lambda k, v: steps.append(v), final_data_consistency=False, **plain),
+        "data": run(**plain),
+        "cut": run(restore=False),
+        "all": run(),
+    }
+    return SimpleNamespace(
+        model=network.model, normal=normal, steps=steps, run=run, plain=plain, **made
+    )
 
 
 def test_steps_and_prior_are_what_is_asked_for(striped):
@@ -157,20 +211,29 @@ def test_steps_and_prior_are_what_is_asked_for(striped):
     torch.testing.assert_close(striped.steps[-1], striped.alone)
     for steps in (1, count + 1):
         seen, asked = [], []
-        found = striped.run(lambda k, v, seen=seen: seen.append(v), steps=steps, final_data_consistency=False,
-                            **striped.plain)  # fmt: skip
+        found = striped.run(
+            lambda k, v, seen=seen: seen.append(v),
+            steps=steps,
+            final_data_consistency=False,
+            **striped.plain,
+        )
         assert len(seen) == steps + 1
         torch.testing.assert_close(seen[1], striped.steps[1])
         torch.testing.assert_close(seen[-1], found)
-        kept = striped.run(prior=lambda v, *_, asked=asked: asked.append(v) or v, steps=steps,
-                           final_data_consistency=False, **striped.plain)  # fmt: skip
+        kept = striped.run(
+            prior=lambda v, *_, asked=asked: asked.append(v) or v,
+            steps=steps,
+            final_data_consistency=False,
+            **striped.plain,
+        )
         assert len(asked) == steps
         torch.testing.assert_close(kept, striped.steps[0])
     assert float((striped.alone - striped.steps[0]).abs().max()) > 0.5
 
 
 def test_every_switch_takes_its_part_out_and_nothing_else(striped):
-    """Each part is tested by itself elsewhere: here that it is there, in its place, in what ships."""
+    """Each part is tested by itself elsewhere: here that it is there, in its place, in what
+    ships."""
     normal, spectrum = striped.normal, striped.normal.spectrum()
     assert energy(normal, striped.data) < energy(normal, striped.alone) - 1.0
     given = []

@@ -1,4 +1,5 @@
-"""MBIR with the tissues of a vessel: sharper than without where they fit, the same where they do not."""
+"""MBIR with the tissues of a vessel: sharper than without where they fit, the same where they do
+not."""
 
 from dataclasses import replace
 
@@ -45,7 +46,11 @@ def solved(drawn, network, fine):
     method = TissueMbir(network)
     found = method.solved(drawn, b, 1.0)
     with torch.no_grad():
-        return network(drawn, b, 1.0)[0], method.in_hu(drawn, found.u, found.normal)[0], found.notes[0]
+        return (
+            network(drawn, b, 1.0)[0],
+            method.in_hu(drawn, found.u, found.normal)[0],
+            found.notes[0],
+        )
 
 
 def test_the_vessel_is_sharper_and_its_core_at_full_contrast(drawn, solved, truth):
@@ -69,12 +74,16 @@ def test_what_no_tissue_is_comes_from_the_data(solved):
 
 
 def test_the_data_are_kept(drawn, network, solved, fine):
-    """The low frequencies of the residual are as small as without tissues, the fit to the data is better."""
+    """The low frequencies of the residual are as small as without tissues, the fit to the data
+    is better."""
     b = statistic(drawn, fine, 1)
     normal = network.problem(drawn, b, 1.0)
     rest = []
     for volume in solved[:2]:
-        u = volume[None] / normal.scale_hu + (drawn.mu_ref - drawn.level) * 1000.0 / drawn.mu_ref / normal.scale_hu
+        u = (
+            volume[None] / normal.scale_hu
+            + (drawn.mu_ref - drawn.level) * 1000.0 / drawn.mu_ref / normal.scale_hu
+        )
         left = normal.beta - normal.apply(u)
         rest.append(-float((u * (left + normal.beta)).sum(dtype=torch.float64)))
     assert rest[1] < rest[0]
@@ -116,7 +125,9 @@ def test_what_is_believed_of_the_vessel_reaches_the_reading(drawn, network, fine
 def test_a_core_is_drawn_as_far_as_it_is_probable(drawn, network, fine, monkeypatch):
     b = statistic(drawn, fine, 1)[0]
     reading = read_plaque(TissueData.of_statistic(b, drawn, 1.0))
-    monkeypatch.setattr(tissues, "read_plaque", lambda *arguments, **settings: replace(reading, presence=0.25))
+    monkeypatch.setattr(
+        tissues, "read_plaque", lambda *arguments, **settings: replace(reading, presence=0.25)
+    )
     around = OutlineMbir(network).drawn(drawn, b, 1.0).image
     found = TissueMbir(network).drawn(drawn, b, 1.0).image
     assert torch.allclose(found, 0.25 * torch.from_numpy(reading.image) + 0.75 * around, atol=1e-3)
@@ -136,7 +147,9 @@ def test_from_a_scan(clean, problem, caplog):
     assert "no tissues were fitted" in caplog.text
 
 
-def test_another_fidelity_keeps_the_tissues_and_noise_units_are_the_inverse_of_hu(drawn, network, truth, fine):
+def test_another_fidelity_keeps_the_tissues_and_noise_units_are_the_inverse_of_hu(
+    drawn, network, truth, fine
+):
     method = TissueMbir(network, (0.0, 0.0, 1.0)).with_fidelity(1.0)
     assert isinstance(method, TissueMbir)
     assert (method.fidelity, method.point) == (1.0, (0.0, 0.0, 1.0))
@@ -149,6 +162,12 @@ def test_another_fidelity_keeps_the_tissues_and_noise_units_are_the_inverse_of_h
 def test_refusals(clean, problem):
     refused(
         ("tissues=True", lambda: reconstruct(clean, GRID, "mbir", point=(0, 0, 0))),
-        ("vessel_prior says", lambda: reconstruct(clean, GRID, "mbir", vessel_prior=VesselPrior(), vessel=False)),
-        ("point must be 3 numbers", lambda: reconstruct(clean, GRID, "mbir", tissues=True, point=(0, 0))),
+        (
+            "vessel_prior says",
+            lambda: reconstruct(clean, GRID, "mbir", vessel_prior=VesselPrior(), vessel=False),
+        ),
+        (
+            "point must be 3 numbers",
+            lambda: reconstruct(clean, GRID, "mbir", tissues=True, point=(0, 0)),
+        ),
     )

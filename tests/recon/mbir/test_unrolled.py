@@ -1,4 +1,5 @@
-"""The unrolled reconstruction: its linear parts against dense solutions, its fidelity, hard cases."""
+"""The unrolled reconstruction: its linear parts against dense solutions, its fidelity, hard
+cases."""
 
 import math
 from dataclasses import replace
@@ -43,7 +44,8 @@ def normal(scan, exposure=1.0, noise=0.0, seed=0, batch=1):
 
 
 def test_normalisation(scan):
-    """H is about 1 at 0.5 lp/mm, and doubling the exposure keeps it while the noise scale falls by √2."""
+    """H is about 1 at 0.5 lp/mm, and doubling the exposure keeps it while the noise scale falls
+    by √2."""
     gram, _, _ = scan
     one, two = normal(scan), normal(scan, exposure=2.0)
     assert float(two.scale_hu / one.scale_hu) == pytest.approx(1 / math.sqrt(2))
@@ -64,7 +66,9 @@ def test_start_is_the_wiener_filter(scan):
 
 def test_no_steps_are_linear(scan):
     net, first, second = model(), normal(scan, noise=1.0, seed=1), normal(scan, noise=1.0, seed=2)
-    both = NormalisedProblem(first.gram, first.beta - 2 * second.beta, first.scale_hu, first.factor, 0.4)
+    both = NormalisedProblem(
+        first.gram, first.beta - 2 * second.beta, first.scale_hu, first.factor, 0.4
+    )
     found = [net(p, steps=0) for p in (first, second, both)]
     torch.testing.assert_close(found[2], found[0] - 2 * found[1], rtol=1e-3, atol=1e-3)
     whole = [net(p) for p in (first, second, both)]
@@ -72,21 +76,27 @@ def test_no_steps_are_linear(scan):
 
 
 def test_final_data_consistency(scan):
-    """Whatever the network adds, the low frequencies of what the scanner sees stay the data's, the more the
-    fidelity."""
+    """Whatever the network adds, the low frequencies of what the scanner sees stay the data's, the
+    more the fidelity."""
     p = normal(scan, noise=1.0)
     quiet, loud = model(), model()
     loud.network.leave.weight.mul_(30.0)
     left = {}
     for fidelity in (0.0, 0.5, 1.0):
         free, bound = (loud(p, fidelity, final_data_consistency=word) for word in (False, True))
-        left[fidelity] = [float(low_residual(p, p.beta - p.apply(u), fidelity)) for u in (free, bound)]
+        left[fidelity] = [
+            float(low_residual(p, p.beta - p.apply(u), fidelity)) for u in (free, bound)
+        ]
         assert left[fidelity][1] < 0.35 * left[fidelity][0]
         # Both networks agree on them.
-        low = torch.exp(-math.log(2) * squared_frequencies(SHAPE, 0.4) / fidelity_frequency(fidelity) ** 2)
+        low = torch.exp(
+            -math.log(2) * squared_frequencies(SHAPE, 0.4) / fidelity_frequency(fidelity) ** 2
+        )
         apart = [
             filtered(
-                quiet(p, fidelity, final_data_consistency=w) - loud(p, fidelity, final_data_consistency=w), low
+                quiet(p, fidelity, final_data_consistency=w)
+                - loud(p, fidelity, final_data_consistency=w),
+                low,
             ).norm()
             for w in (False, True)
         ]
@@ -95,7 +105,8 @@ def test_final_data_consistency(scan):
 
 
 def test_another_prior_takes_the_place_of_the_network(scan):
-    """The filter alone asks nothing of the weights, and what it gives is made consistent with the data."""
+    """The filter alone asks nothing of the weights, and what it gives is made consistent with
+    the data."""
     p = normal(scan, noise=1.0)
     first, second = (model(seed, bilateral=True) for seed in (0, 1))
     found = first(p, 0.5, prior=bilateral_prior)
@@ -129,7 +140,9 @@ def test_batch_equals_single(scan):
     generator = torch.Generator().manual_seed(0)
     noise = scan[0].noise((3,), generator=generator)
     for k in range(3):
-        p = NormalisedProblem.from_statistic(scan[0], (scan[2] + noise[k])[None], torch.ones(1), HU, 0.4)
+        p = NormalisedProblem.from_statistic(
+            scan[0], (scan[2] + noise[k])[None], torch.ones(1), HU, 0.4
+        )
         torch.testing.assert_close(net(p)[0], together[k], rtol=1e-4, atol=1e-4)
 
 
@@ -153,7 +166,8 @@ def test_noise_levels_of_the_training_are_kept(scan):
 
 @pytest.mark.parametrize("size", [0.0, 1e-12, 1e6])
 def test_extreme_data_stay_in_proportion(scan, size):
-    """Homogeneous of degree one at a given noise scale: from nothing to a million times the statistic."""
+    """Homogeneous of degree one at a given noise scale: from nothing to a million times the
+    statistic."""
     net, p = model(), normal(scan, noise=1.0)
     scaled = NormalisedProblem(p.gram, p.beta * size, p.scale_hu, p.factor, 0.4)
     found, expected = net(scaled), net(p) * size

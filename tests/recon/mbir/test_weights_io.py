@@ -55,5 +55,7 @@ def test_damaged_weights_are_refused_with_the_remedy(shipped, tmp_path):
     good, path = shipped.read_bytes(), tmp_path / "weights.safetensors"
     for bad in (good[:-1] + bytes([good[-1] ^ 1]), good[:-1]):
         path.write_bytes(bad)
-        with pytest.raises(ValueError, match=rf"{re.escape(str(path))} .*another copy.*new installation"):
+        with pytest.raises(
+            ValueError, match=rf"{re.escape(str(path))} .*another copy.*new installation"
+        ):
             Mbir.load(path)

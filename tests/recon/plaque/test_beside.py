@@ -13,7 +13,9 @@ from torchpcct.metrics.roi import RoiMean
 
 
 def test_deviations_are_those_of_fbp(clean):
-    z, y, x = np.meshgrid(*(a - c for a, c in zip(GRID.axes, GRID.center, strict=True)), indexing="ij")
+    z, y, x = np.meshgrid(
+        *(a - c for a, c in zip(GRID.axes, GRID.center, strict=True)), indexing="ij"
+    )
     regions = {
         "fibrous": (np.abs(x + 0.8) < 0.5) & (np.abs(y) < 1) & (np.abs(z) < 1),
         "core": (np.abs(x - 0.8) < 0.5) & (np.abs(y) < 1) & (np.abs(z) < 1),
@@ -25,9 +27,15 @@ def test_deviations_are_those_of_fbp(clean):
     # The ball takes some of the photons, which the expected readings do not know.
     for k, name in enumerate(("fibrous", "core", "fat")):
         assert found[name] == pytest.approx(exact[k, k] ** 0.5, rel=0.03)
-    assert found["contrast"] == pytest.approx((exact[0, 0] + exact[1, 1] - 2 * exact[0, 1]) ** 0.5, rel=0.03)
+    assert found["contrast"] == pytest.approx(
+        (exact[0, 0] + exact[1, 1] - 2 * exact[0, 1]) ** 0.5, rel=0.03
+    )
 
 
 def test_a_scan_of_the_whole_detector_is_refused():
     with pytest.raises(ValueError, match="surround is known"):
-        fbp_deviations(SimpleNamespace(window=None, surround=None), GRID, {"fat": np.ones(GRID.shape, np.float32)})
+        fbp_deviations(
+            SimpleNamespace(window=None, surround=None),
+            GRID,
+            {"fat": np.ones(GRID.shape, np.float32)},
+        )

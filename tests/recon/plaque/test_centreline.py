@@ -25,7 +25,10 @@ def test_coordinates_about_an_arc():
     assert np.allclose(c.rho, np.hypot(off, side), atol=2e-3)
     assert np.allclose(np.einsum("nij,nkj->nik", c.frame, c.frame), np.eye(3), atol=1e-6)
     # The frame does not turn: along a plane arc the angle about the line is the one in the section.
-    sense = np.sign(np.sin(c.theta[1] - c.theta[0]) * np.sin((expected := np.arctan2(side, off))[1] - expected[0]))
+    sense = np.sign(
+        np.sin(c.theta[1] - c.theta[0])
+        * np.sin((expected := np.arctan2(side, off))[1] - expected[0])
+    )
     turned = c.theta - sense * expected
     assert np.allclose(np.exp(1j * (turned - turned[0])), 1, atol=0.02)
 
@@ -46,7 +49,9 @@ def test_follows_a_tube_in_any_direction(direction):
     points = np.stack(np.meshgrid(*GRID.axes, indexing="ij"), -1) - np.array(GRID.center)
     along = points @ d
     distance = np.linalg.norm(points - along[..., None] * d, axis=-1)
-    volume = 400 / (1 + np.exp((distance - 1.2) / 0.1)) + 20 * np.random.default_rng(0).standard_normal(GRID.shape)
+    volume = 400 / (1 + np.exp((distance - 1.2) / 0.1)) + 20 * np.random.default_rng(
+        0
+    ).standard_normal(GRID.shape)
     line, ends = follow(volume, GRID, 200.0, np.array(GRID.center) + 0.3, 1.8)
     middle = line.point(np.linspace(0, line.length, 20)) - np.array(GRID.center)
     assert np.linalg.norm(middle - (middle @ d)[:, None] * d, axis=1).max() < 0.1
@@ -63,8 +68,11 @@ def test_nothing_to_follow():
 
 
 def test_a_narrow_lumen_is_followed_though_it_is_brighter_in_its_middle():
-    """A ball much wider than the lumen stayed at its brightest part: "no direction, or shorter than 5 mm"."""
-    z, y, x = np.meshgrid(*(a - c for a, c in zip(GRID.axes, GRID.center, strict=True)), indexing="ij", sparse=True)
+    """A ball much wider than the lumen stayed at its brightest part: "no direction, or shorter
+    than 5 mm"."""
+    z, y, x = np.meshgrid(
+        *(a - c for a, c in zip(GRID.axes, GRID.center, strict=True)), indexing="ij", sparse=True
+    )
     rho = np.hypot(y, x)
     lumen = np.exp(-((rho / 0.6) ** 2)) * (200.0 + 100.0 * np.exp(-((z / 1.2) ** 2)))
     pilot = -90.0 + 150.0 / (1.0 + np.exp((rho - 1.3) / 0.15)) + lumen
@@ -75,12 +83,18 @@ def test_a_narrow_lumen_is_followed_though_it_is_brighter_in_its_middle():
 
 
 def test_what_holds_a_walk_back_is_no_end():
-    """A bright place held the walk back 1 mm beside it: the vessel was taken to leave the volume there, and narrowed to
-    nothing where it did not."""
-    z, y, x = np.meshgrid(*(a - c for a, c in zip(GRID.axes, GRID.center, strict=True)), indexing="ij", sparse=True)
+    """A bright place held the walk back 1 mm beside it: the vessel was taken to leave the volume
+    there, and narrowed to nothing where it did not."""
+    z, y, x = np.meshgrid(
+        *(a - c for a, c in zip(GRID.axes, GRID.center, strict=True)), indexing="ij", sparse=True
+    )
     rho = np.hypot(y, x)
-    lumen = 300.0 / (1.0 + np.exp((rho - 0.7) / 0.1)) * (1.0 + 8.0 * np.exp(-(((z + 1.5) / 0.4) ** 2)))
-    pilot = np.where(np.abs(z) < 4.0, -90.0 + 150.0 / (1.0 + np.exp((rho - 1.2) / 0.1)) + lumen, -90.0)
+    lumen = (
+        300.0 / (1.0 + np.exp((rho - 0.7) / 0.1)) * (1.0 + 8.0 * np.exp(-(((z + 1.5) / 0.4) ** 2)))
+    )
+    pilot = np.where(
+        np.abs(z) < 4.0, -90.0 + 150.0 / (1.0 + np.exp((rho - 1.2) / 0.1)) + lumen, -90.0
+    )
     line, ends = follow(pilot, GRID, 230.0, np.array(GRID.center) - (1.5, 0.0, 0.0), 1.8)
     reached = np.sort(line.point(ends)[:, 0]) - GRID.center[0]
     assert np.allclose(reached, (-4.0, 4.0), atol=0.3)

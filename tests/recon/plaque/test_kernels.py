@@ -15,7 +15,8 @@ from recon.plaque.vessel import SOFT, _behind
 
 @pytest.mark.parametrize("radius", [0.9, 1.1, 2.3])
 def test_what_is_taken_off_is_what_drawing_and_projecting_have_averaged(radius):
-    """Chords of a disc by its soft drawing, each value projected as a box; means over voxels take a higher value."""
+    """Chords of a disc by its soft drawing, each value projected as a box; means over voxels
+    take a higher value."""
     step, count, off = 0.2, 40, 0.03
     at = (np.arange(count) - 19.5) * step
     y, x = np.meshgrid(at, at, indexing="ij")
@@ -25,16 +26,19 @@ def test_what_is_taken_off_is_what_drawing_and_projecting_have_averaged(radius):
     boxes = np.mean([np.hypot(y + a, x + b - off) < radius for a in sub for b in sub], 0)
     place = np.pad(np.arange(count**2).reshape(count, count), 1, constant_values=-1)
     beside = [
-        place[1 + a : 1 + a + count, 1 + b : 1 + b + count].ravel() for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1))
+        place[1 + a : 1 + a + count, 1 + b : 1 + b + count].ravel()
+        for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1))
     ]
     none = np.full(count**2, -1)
     out, own = np.empty((count**2, 1)), soft.reshape(-1, 1).copy()
     sharpened(own, np.stack([none, none, *beside], 1), SOFT**2 + 1 / 12, out)
-    # The stencil takes what lies on either side of the plane for 0: an endless tube is as high there as here.
+    # The stencil takes what lies on either side of the plane for 0: an endless tube is as high
+    # there as here.
     image = (out - (SOFT**2 + 1 / 12) * own).reshape(count, count)
 
     def factor(image):
-        """Multiple of a drawing's projection along y that is nearest to the exact chords, on cells of 0.5 mm."""
+        """Multiple of a drawing's projection along y that is nearest to the exact chords, on
+        cells of 0.5 mm."""
         fine = (np.arange(4000) - 1999.5) * 0.002
         chords = 2 * np.sqrt(np.clip(radius**2 - (fine - off) ** 2, 0.0, None))
         seen = step * image.sum(0)[np.clip(np.floor((fine + 4.0) / step).astype(int), 0, count - 1)]
@@ -50,9 +54,22 @@ def body(centre, semi, spacing=0.2, count=24, cap=0.0, lumen=None):
     n = len(points)
     far = np.full(n, 50.0) if lumen is None else lumen(points)
     out = np.empty((1, n), np.float32)
-    core_fractions(0, 1, np.array([centre]), np.eye(3)[None], np.array([semi]), np.array([cap]), points,
-                   np.full(3, SOFT * spacing), np.ones(n), far, np.full(n, SOFT * spacing),
-                   np.tile([0.0, 0.0, 1.0], (n, 1)), 0.0, out)  # fmt: skip
+    core_fractions(
+        0,
+        1,
+        np.array([centre]),
+        np.eye(3)[None],
+        np.array([semi]),
+        np.array([cap]),
+        points,
+        np.full(3, SOFT * spacing),
+        np.ones(n),
+        far,
+        np.full(n, SOFT * spacing),
+        np.tile([0.0, 0.0, 1.0], (n, 1)),
+        0.0,
+        out,
+    )
     return float(out.sum(dtype=np.float64)) * spacing**3
 
 
@@ -63,9 +80,12 @@ def test_volume_of_an_ellipsoid(semi):
 
 
 def test_the_cap_cuts_a_ball_in_half():
-    """A lumen whose surface is 0.17 mm from the ball's middle plane: half of the ball is left with a cap of 0.17."""
+    """A lumen whose surface is 0.17 mm from the ball's middle plane: half of the ball is left
+    with a cap of 0.17."""
     whole = 4 / 3 * math.pi * 0.8**3
-    assert body((0, 0, 0), (0.8,) * 3, cap=0.17, lumen=lambda p: p[:, 2] + 0.17) == pytest.approx(whole / 2, rel=0.01)
+    assert body((0, 0, 0), (0.8,) * 3, cap=0.17, lumen=lambda p: p[:, 2] + 0.17) == pytest.approx(
+        whole / 2, rel=0.01
+    )
 
 
 @pytest.mark.parametrize("nodes", [5, 9])
@@ -84,12 +104,18 @@ def test_blocks_are_the_operator(nodes):
     size = np.abs(x.T @ exact).max()
     assert np.abs(local.apply(x[:, :1]) - exact[:, :1]).max() < 2e-5 * np.abs(exact).max()
     assert np.abs(local.curvature(x) - x.T @ exact).max() < 2e-5 * size
-    assert np.abs(local.energies(np.ascontiguousarray(x.T)) - np.diag(x.T @ exact)).max() < 2e-5 * size
+    assert (
+        np.abs(local.energies(np.ascontiguousarray(x.T)) - np.diag(x.T @ exact)).max() < 2e-5 * size
+    )
     chosen = np.flatnonzero(rng.random(len(index)) < 0.3)
     few = np.zeros_like(x)
     few[chosen] = x[chosen]
-    assert np.allclose(local.part(chosen).apply(x[chosen]), local.apply(few)[chosen], rtol=1e-4,
-                       atol=1e-5 * np.abs(exact).max())  # fmt: skip
+    assert np.allclose(
+        local.part(chosen).apply(x[chosen]),
+        local.apply(few)[chosen],
+        rtol=1e-4,
+        atol=1e-5 * np.abs(exact).max(),
+    )
 
 
 def test_too_many_voxels_are_refused(monkeypatch):

@@ -31,7 +31,8 @@ def fit(data):
 
 @pytest.fixture(scope="module")
 def dense(fit):
-    """Of parameters and white field: the joint matrix of the normal equations, its right side, and B = L σ S."""
+    """Of parameters and white field: the joint matrix of the normal equations, its right side,
+    and B = L σ S."""
     vessel, p, field = fit.vessel, len(fit.parameters), LayerField(fit.vessel, fit.layer)
     n = field.size
     B = layer.SD_HU * fit.layer[:, None] * np.stack([field.of(w) for w in np.eye(n)], 1)
@@ -56,7 +57,9 @@ def test_field_has_unit_variance_and_correlations_along_around_and_across(fit):
     turn = (c.theta[inside, None] - c.theta[inside] + np.pi) % (2 * np.pi) - np.pi
     squares = [
         ((x / length) ** 2)
-        for x, length in zip((s[:, None] - s, turn * radius, rho[:, None] - rho), LENGTHS_MM, strict=True)
+        for x, length in zip(
+            (s[:, None] - s, turn * radius, rho[:, None] - rho), LENGTHS_MM, strict=True
+        )
     ]
     # Interpolation between nodes half a length apart.
     assert np.abs(K - np.exp(-0.5 * sum(squares))).max() < 0.05
@@ -77,7 +80,12 @@ def test_contents_and_step_are_those_of_the_joint_mode(fit, dense):
     assert contents.std() > 10.0
     inside = found.image[tuple(fit.vessel.index.T)] - found.fit.image[tuple(fit.vessel.index.T)]
     assert np.abs(inside - contents).max() < 0.5
-    assert np.abs(found.fit.drawing.soft - fit.vessel.draw(fit.parameters + exact[:p], fit.bodies).soft).max() < 2.0
+    assert (
+        np.abs(
+            found.fit.drawing.soft - fit.vessel.draw(fit.parameters + exact[:p], fit.bodies).soft
+        ).max()
+        < 2.0
+    )
 
 
 @pytest.mark.extended
@@ -94,11 +102,16 @@ def test_a_step_that_leads_up_is_not_taken(fit, dense, monkeypatch):
 def test_change_is_symmetric_and_that_of_a_new_fit(data, fit):
     estimate = LayerEstimate(fit)
     noise = [
-        data.gram.noise(generator=torch.Generator().manual_seed(s)).double() * 0.05 * data.scale**0.5 for s in (2, 3)
+        data.gram.noise(generator=torch.Generator().manual_seed(s)).double()
+        * 0.05
+        * data.scale**0.5
+        for s in (2, 3)
     ]
     changes = [estimate.change(v.numpy()) for v in noise]
     cross = [float((changes[k] * noise[1 - k].numpy()).sum()) for k in (0, 1)]
-    assert cross[0] == pytest.approx(cross[1], abs=0.02 * float((changes[0] * noise[0].numpy()).sum()))
+    assert cross[0] == pytest.approx(
+        cross[1], abs=0.02 * float((changes[0] * noise[0].numpy()).sum())
+    )
     others = [replace(data, b=data.b + s * noise[0].to(data.b)) for s in (1, -1)]
     there = [LayerEstimate(fitted(other)).image for other in others]
     real = 0.5 * (there[0] - there[1])

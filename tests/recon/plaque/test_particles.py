@@ -7,7 +7,8 @@ import pytest
 
 from recon.plaque.particles import lead
 
-MEAN, SD = np.array([1.0, -0.5, 0.3]), np.array([0.2, 0.5, 0.1])
+MEAN = np.array([1.0, -0.5, 0.3])
+SD = np.array([0.2, 0.5, 0.1])
 
 
 def prior(x):

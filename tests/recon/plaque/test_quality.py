@@ -1,4 +1,5 @@
-"""What the model lacks: texture is measured, a calcification becomes a body, a foreign body is warned of."""
+"""What the model lacks: texture is measured, a calcification becomes a body, a foreign body is
+warned of."""
 
 from copy import copy
 from dataclasses import replace
@@ -39,7 +40,8 @@ def test_texture_is_told_from_none(gram):
     assert textured.sd_hu > 25
     assert smooth.high_hu < 25
     assert textured.sd_of("contrast") >= 0
-    # Data that say next to nothing leave the prior: the variance's mean, and its 95 % limit, ln 20 times as much.
+    # Data that say next to nothing leave the prior: the variance's mean, and its 95 % limit, ln 20
+    # times as much.
     vessel, fit = copy(fits[0][0]), fits[0][1]
     whole = vessel.gram
     vessel.gram = SimpleNamespace(apply=lambda v: 1e-6 * whole.apply(v))
@@ -57,7 +59,9 @@ def test_texture_is_told_from_none(gram):
 
 
 def test_a_calcification_becomes_a_body_and_not_a_core(gram, tmp_path):
-    found = read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0, 3, 1200.0), 5), particles=150)
+    found = read_plaque(
+        drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0, 3, 1200.0), 5), particles=150
+    )
     assert found.calcifications >= 1  # a coarse grid may make two bodies of it
     assert abs(found.chi2 - 1) < 4 * found.chi2_sd
     assert found.presence < 0.95
@@ -85,7 +89,9 @@ def test_what_the_model_does_not_have_is_warned_of(gram):
 
 def tube(grid, at, radius):
     """``grid.shape`` share of a tube along z through (y, x) mm about the grid's centre."""
-    _, y, x = np.meshgrid(*(a - c for a, c in zip(grid.axes, grid.center, strict=True)), indexing="ij", sparse=True)
+    _, y, x = np.meshgrid(
+        *(a - c for a, c in zip(grid.axes, grid.center, strict=True)), indexing="ij", sparse=True
+    )
     edge = (radius - np.hypot(y - at[0], x - at[1])) / grid.spacing[0]
     return torch.from_numpy(np.clip(edge + 0.5, 0.0, 1.0) + np.zeros(grid.shape)).float()
 
@@ -133,8 +139,14 @@ def test_beside_a_second_vessel_that_is_not_known_nothing_of_a_plaque_is_claimed
 
 def test_noise_alone_is_not_striking_anywhere_in_the_volume(gram):
     data = drawn_vessel.data(gram, torch.zeros(gram.finer.shape))
-    scores = np.array([data.scores(gram.noise(generator=torch.Generator().manual_seed(k)) * drawn_vessel.HU, (0.4, 1.2))
-                       for k in range(20)])  # fmt: skip
+    scores = np.array(
+        [
+            data.scores(
+                gram.noise(generator=torch.Generator().manual_seed(k)) * drawn_vessel.HU, (0.4, 1.2)
+            )
+            for k in range(20)
+        ]
+    )
     assert np.abs(scores).max() < STRIKING
     assert scores.std() == pytest.approx(1.0, abs=0.15)
     assert scores[:, [0, -1]].std() < 1.4
@@ -142,13 +154,19 @@ def test_noise_alone_is_not_striking_anywhere_in_the_volume(gram):
 
 @pytest.mark.parametrize(
     ("change", "why"),
-    [({"lumen": 40.0}, "only with contrast agent"), ({"lumen": 150.0}, "only with contrast agent"),
-     ("stent", "no vessel that can be read"), ("rings", "no direction, or is shorter than 5 mm. Rings of metal"),
-     ("short", "no direction, or is shorter")],
-)  # fmt: skip
+    [
+        ({"lumen": 40.0}, "only with contrast agent"),
+        ({"lumen": 150.0}, "only with contrast agent"),
+        ("stent", "no vessel that can be read"),
+        ("rings", "no direction, or is shorter than 5 mm. Rings of metal"),
+        ("short", "no direction, or is shorter"),
+    ],
+)
 def test_what_is_no_enhanced_vessel_is_refused_in_words(gram, change, why):
     """A stent was refused by SciPy's own words, a short bright piece by a division by zero."""
-    volume = drawn_vessel.image(gram.finer, 0.0, samples=2, **(change if isinstance(change, dict) else {}))
+    volume = drawn_vessel.image(
+        gram.finer, 0.0, samples=2, **(change if isinstance(change, dict) else {})
+    )
     off = torch.arange(len(volume))[:, None, None] / 2 - (len(volume) - 1) / 4
     inside = tube(gram.finer, (0.0, drawn_vessel.LUMEN_OFF), 1.1)
     shell = inside - tube(gram.finer, (0.0, drawn_vessel.LUMEN_OFF), 0.9)
@@ -164,18 +182,27 @@ def test_what_is_no_enhanced_vessel_is_refused_in_words(gram, change, why):
 
 @pytest.mark.extended
 def test_a_second_core_is_read_beside_the_first(gram, tmp_path):
-    point = (gram.grid.center[0] - 1.5, gram.grid.center[1] - 1.5 * drawn_vessel.TILT, gram.grid.center[2] + 1.15)
+    point = (
+        gram.grid.center[0] - 1.5,
+        gram.grid.center[1] - 1.5 * drawn_vessel.TILT,
+        gram.grid.center[2] + 1.15,
+    )
     two, one = (
-        read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 200.0, 3, cores=cores), 9), point,
-                    particles=60)
+        read_plaque(
+            drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 200.0, 3, cores=cores), 9),
+            point,
+            particles=60,
+        )
         for cores in ((-1.5, 1.5), (-1.5,))
-    )  # fmt: skip
+    )
     assert [r.presence > 0.95 for r in (two, one)] == [True, True]
     assert two.second_core > 0.95 > 0.7 > one.second_core
     assert two.warnings == one.warnings == []
     assert one.info["second_core"] is None
     other = two.info["second_core"]
-    assert np.linalg.norm(np.array(other["at_mm"]) - point - (3.0, 3.0 * drawn_vessel.TILT, 0.0)) < 0.6
+    assert (
+        np.linalg.norm(np.array(other["at_mm"]) - point - (3.0, 3.0 * drawn_vessel.TILT, 0.0)) < 0.6
+    )
     assert other["volume_mm3"] == pytest.approx(1.05, rel=0.6)
     for name in ("contrast", "second contrast"):
         assert abs(two.figures[name].value - 200.0) < 3.5 * two.figures[name].sd

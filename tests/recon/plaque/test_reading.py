@@ -20,20 +20,28 @@ POINT_OFF = (0.0, 0.0, drawn_vessel.CORE_OFF)
 @pytest.fixture(scope="module")
 def strong(gram):
     """A core 100 HU below the fibrous tissue, with noise."""
-    return read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 100.0), seed=1), particles=150)
+    return read_plaque(
+        drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 100.0), seed=1), particles=150
+    )
 
 
 @pytest.fixture(scope="module")
 def absent(gram):
-    return read_plaque(drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0), seed=1), particles=150)
+    return read_plaque(
+        drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0), seed=1), particles=150
+    )
 
 
 def test_a_core_is_found_and_its_figures_hold_the_truth(strong):
     assert strong.presence > 0.95
     assert not strong.refused
     figures = strong.figures
-    for name, truth in (("contrast", 100.0), ("fibrous", VALUES["fibrous"]), ("lumen", VALUES["lumen"]),
-                        ("lumen area", np.pi * drawn_vessel.LUMEN_MM**2)):  # fmt: skip
+    for name, truth in (
+        ("contrast", 100.0),
+        ("fibrous", VALUES["fibrous"]),
+        ("lumen", VALUES["lumen"]),
+        ("lumen area", np.pi * drawn_vessel.LUMEN_MM**2),
+    ):
         e = figures[name]
         assert abs(e.value - truth) < 3 * e.sd, name
         assert e.low < e.value < e.high
@@ -91,7 +99,11 @@ def test_refusals(gram):
 
 @pytest.mark.parametrize(
     ("presence", "low", "high", "why"),
-    [(0.94, 20.0, 80.0, "probability of 0.94"), (0.99, -130.0, 160.0, "several explanations"), (0.99, 20.0, 80.0, "")],
+    [
+        (0.94, 20.0, 80.0, "probability of 0.94"),
+        (0.99, -130.0, 160.0, "several explanations"),
+        (0.99, 20.0, 80.0, ""),
+    ],
 )
 def test_doubt_has_a_reason(presence, low, high, why):
     found = _doubt(presence, Estimate((low + high) / 2, low, high, (high - low) / 4, "HU"))
@@ -100,7 +112,8 @@ def test_doubt_has_a_reason(presence, low, high, why):
 
 
 def test_one_blas_thread_reads_the_tissues(gram, monkeypatch):
-    """Its matrices are so small that more threads take three times as long, and round in another order."""
+    """Its matrices are so small that more threads take three times as long, and round in another
+    order."""
 
     class Seen(Exception):
         pass

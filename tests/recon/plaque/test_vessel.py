@@ -1,4 +1,5 @@
-"""The vessel's model: its drawing and derivatives, and the fit to noise-free data of known tissues."""
+"""The vessel's model: its drawing and derivatives, and the fit to noise-free data of known
+tissues."""
 
 from types import SimpleNamespace
 
@@ -35,10 +36,13 @@ def test_jacobian(vessel):
         for k, column in zip(columns, numeric.T, strict=True):
             step = np.zeros_like(theta)
             step[k] = 1e-3 if len(columns) == 1 else 1e-4
-            ahead, behind = (vessel.draw(theta + s * step, bodies, jacobian=False).image for s in (1, -1))
+            ahead, behind = (
+                vessel.draw(theta + s * step, bodies, jacobian=False).image for s in (1, -1)
+            )
             column[:] = (ahead - behind) / (2 * step[k])
-        # What the normal's turn changes is left out of the derivative: second order in the outline's slope, and most
-        # for splines that reach little of the vessel, so the measure is the outline's largest column.
+        # What the normal's turn changes is left out of the derivative: second order in the
+        # outline's slope, and most for splines that reach little of the vessel, so the measure is
+        # the outline's largest column.
         error, size = (np.linalg.norm(v, axis=0) for v in (found[:, columns] - numeric, numeric))
         assert error.max() <= 0.06 * size.max() + 1e-6
 
@@ -61,13 +65,17 @@ def test_fit_finds_tissues_and_outlines(vessel, fit):
 @pytest.mark.extended
 @pytest.mark.parametrize("seed", [2, 3, 5])
 def test_fit_goes_to_the_mode_from_afar(gram, seed):
-    """It stopped where a shortened step gained little: for seed 5 at 63 in the log posterior short of the mode."""
+    """It stopped where a shortened step gained little: for seed 5 at 63 in the log posterior
+    short of the mode."""
     data = drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0, samples=2), seed)
     vessel = Vessel(data, find_vessel(data.pilot(), data.grid, None))
     afar = vessel.first_guess()
     afar[vessel.lumen_part] *= 1.3
     afar[vessel.outer_part] *= 0.8
-    found, mode = vessel.fit(afar, expected=True), vessel.fit(afar, expected=True, steps=60, tolerance=1e-5)
+    found, mode = (
+        vessel.fit(afar, expected=True),
+        vessel.fit(afar, expected=True, steps=60, tolerance=1e-5),
+    )
     assert found.energy - mode.energy < 0.6
 
 
@@ -96,14 +104,16 @@ class Scripted(Vessel):
 
 
 def test_a_step_that_leads_up_is_shortened_to_a_tenth_at_most():
-    """The parabola through a wall of energy has its top next to where the step began: nothing is gained there."""
+    """The parabola through a wall of energy has its top next to where the step began: nothing is
+    gained there."""
     model = Scripted(lambda x: 1e9 if x > 0.02 else -x)
     model.fit(np.zeros(FAT + 1), steps=1)
     assert model.tried == pytest.approx([0.0, 1.0, 0.1, 0.01])
 
 
 def test_fit_is_a_mode(vessel, fit):
-    """A Newton step from the mode promises nothing, and the residual is b − Gx of the whole volume."""
+    """A Newton step from the mode promises nothing, and the residual is b − Gx of the whole
+    volume."""
     assert 0.5 * fit.gradient @ fit.covariance @ fit.gradient < 0.2
     volume = torch.full(vessel.grid.shape, fit.parameters[FAT])
     volume[tuple(vessel.index.T)] += torch.from_numpy(fit.drawing.image).float()
@@ -130,7 +140,10 @@ def test_evidence_of_a_body_is_the_ratio_of_two_gaussian_integrals(vessel, fit):
         pull = np.append(fit.gradient, c[:, 0] @ fit.residual)
 
         def log(hessian, gradient):
-            return 0.5 * gradient @ np.linalg.solve(hessian, gradient) - 0.5 * np.linalg.slogdet(hessian)[1]
+            return (
+                0.5 * gradient @ np.linalg.solve(hessian, gradient)
+                - 0.5 * np.linalg.slogdet(hessian)[1]
+            )
 
         exact = log(joint, pull) - log(fit.hessian, fit.gradient) - np.log(100.0)
         assert seen.log[k] == pytest.approx(exact, rel=1e-3, abs=2e-3)
@@ -139,7 +152,8 @@ def test_evidence_of_a_body_is_the_ratio_of_two_gaussian_integrals(vessel, fit):
 
 
 def test_data_of_a_scan_in_hu(problem, clean):
-    """b and G in HU: the likelihood's mode is the least-squares volume, whatever unit it is written in."""
+    """b and G in HU: the likelihood's mode is the least-squares volume, whatever unit it is
+    written in."""
     from recon.plaque.data import TissueData
 
     found = TissueData.of_scan(clean, problem)
@@ -147,7 +161,9 @@ def test_data_of_a_scan_in_hu(problem, clean):
     hu = problem.mu_ref / 1000
     attenuation = (volume / 1000 + 1) * problem.mu_ref - problem.level
     exact = (problem.statistic(clean).b - problem.gram.apply(attenuation)) * hu
-    assert torch.allclose(found.b - found.apply(volume), exact, atol=1e-4 * float(exact.abs().max()))
+    assert torch.allclose(
+        found.b - found.apply(volume), exact, atol=1e-4 * float(exact.abs().max())
+    )
 
 
 def test_no_vessel():
@@ -156,4 +172,6 @@ def test_no_vessel():
     with pytest.raises(ValueError, match="nothing stands out"):
         find_vessel(data.pilot(), data.grid, None)
     with pytest.raises(ValueError, match="outside of the volume"):
-        find_vessel(drawn_vessel.image(gram.grid, 0.0).numpy(), gram.grid, np.array([50.0, -30.0, -30.0]))
+        find_vessel(
+            drawn_vessel.image(gram.grid, 0.0).numpy(), gram.grid, np.array([50.0, -30.0, -30.0])
+        )

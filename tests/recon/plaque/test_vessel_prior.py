@@ -50,7 +50,8 @@ def test_a_firm_belief_holds_and_a_loose_one_gives_way(seen):
 
 
 def test_a_belief_in_the_difference_alone_gives_way_together(seen):
-    """Both means 100 HU off: with a shift the fit finds the values, and what the prior says of their difference."""
+    """Both means 100 HU off: with a shift the fit finds the values, and what the prior says of
+    their difference."""
     off = []
     for shift in (0.0, 200.0):
         means = [drawn_vessel.VALUES[t] + 100.0 for t in ("wall", "fibrous")]
@@ -65,4 +66,8 @@ def test_orders_are_those_of_both_outlines(seen):
     for orders in (2, 3, 4):
         vessel = Vessel(*seen, VesselPrior(orders=orders))
         guess = vessel.first_guess()
-        assert vessel.lumen_shape(guess).shape[1] == vessel.outer_shape(guess).shape[1] == 2 * orders + 1
+        assert (
+            vessel.lumen_shape(guess).shape[1]
+            == vessel.outer_shape(guess).shape[1]
+            == 2 * orders + 1
+        )

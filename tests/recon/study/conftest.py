@@ -1,7 +1,8 @@
 """Every study at its smallest scale, measured when it is first asked for.
 
-A session's fixture is one for each process, and ``--dist worksteal`` gives a process tests that stand together. So a
-study is measured once or, where a file is shared, twice a session, if only its own test file asks for it.
+A session's fixture is one for each process, and ``--dist worksteal`` gives a process tests that
+stand together. So a study is measured once or, where a file is shared, twice a session, if only its
+own test file asks for it.
 """
 
 import functools

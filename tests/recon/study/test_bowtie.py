@@ -1,4 +1,5 @@
-"""Study ``bowtie``: noise model and corrections of its slices, intervals, and a run at the smallest scale."""
+"""Study ``bowtie``: noise model and corrections of its slices, intervals, and a run at the
+smallest scale."""
 
 import math
 from dataclasses import replace
@@ -43,7 +44,9 @@ def test_the_polynomial_meets_its_calibration(scanners):
     line = polynomial_linearisation(scanner)
     assert line.coefficients.shape == (scanner.geometry.columns, 5)
     for t in (10.0, 200.0, 380.0):
-        p = -np.log(scanner.behind({material("water"): t})[0].sum(-1) / scanner.weights()[1][0].sum(-1))
+        p = -np.log(
+            scanner.behind({material("water"): t})[0].sum(-1) / scanner.weights()[1][0].sum(-1)
+        )
         reached = line.apply(torch.from_numpy(p)).numpy() / line.mu_ref
         np.testing.assert_allclose(reached, t, atol=0.15)
     assert line.mu_ref == pytest.approx(scanner.water_linearisation().mu_ref, rel=1e-12)
@@ -63,7 +66,9 @@ def test_expected_readings_are_those_of_the_scanner(scanners, water):
         middle = scanner.geometry.columns // 2
         half = math.sin(float(scanner.geometry.fan_angles[middle])) * 626.0
         chord = 2.0 * math.sqrt(100.0**2 - half**2)
-        expected = scanner.behind({material("water"): chord})[0, middle].sum() * scanner.mas_per_view(1.0)
+        expected = scanner.behind({material("water"): chord})[
+            0, middle
+        ].sum() * scanner.mas_per_view(1.0)
         assert float(water[bowtie].counts[0, 0, middle]) == pytest.approx(expected, rel=2e-5)
 
 
@@ -114,11 +119,15 @@ def test_transmission_is_equal_inside_the_region():
 
 def test_ratios_and_regions():
     doses = {"large": CtdiDose(1.0, 4.0), "large+roi": CtdiDose(1.0, 2.0)}
-    assert ratios(doses) == pytest.approx({"peripheral": 0.5, "central": 1.0, "weighted": 5.0 / 9.0})
+    assert ratios(doses) == pytest.approx(
+        {"peripheral": 0.5, "central": 1.0, "weighted": 5.0 / 9.0}
+    )
     scene, scanners = water_cylinder(200.0), wide_scanners(8)
     maps = dose_maps(scene, scanners, VolumeGrid((22, 22), 10.0), EXPOSURE_S, 0, 0)
     large, roi = maps.doses["unscattered"]
-    assert region_ratio(maps, scene, ("cylinder",)) == {"unscattered": pytest.approx(np.nansum(roi) / np.nansum(large))}
+    assert region_ratio(maps, scene, ("cylinder",)) == {
+        "unscattered": pytest.approx(np.nansum(roi) / np.nansum(large))
+    }
     assert np.nanmin(roi[large > 0] / large[large > 0]) > 0.3
     with pytest.raises(ValueError, match="voxels"):
         region_ratio(maps, scene, ("bone",))
@@ -126,16 +135,29 @@ def test_ratios_and_regions():
 
 @pytest.mark.slow
 def test_report(tiny, tmp_path):
-    sections = ("## CTDI phantom", "## Thorax", "## Noise", "## MBIR and ROI bowtie", "## What was modelled")
+    sections = (
+        "## CTDI phantom",
+        "## Thorax",
+        "## Noise",
+        "## MBIR and ROI bowtie",
+        "## What was modelled",
+    )
     study = tiny("bowtie")
     data = assert_report_is_whole(study, tmp_path, {"bowtie.png"}, sections)
     assert len({step for step, _ in study.steps}) >= 5
     assert "was fitted to" in study.report.text
     outcome = {c["name"]: c for c in data["checks"]}
-    for name in ("central dose, with / without", "peripheral dose, with / without", "noise inside the ROI"):
+    for name in (
+        "central dose, with / without",
+        "peripheral dose, with / without",
+        "noise inside the ROI",
+    ):
         assert next(c for n, c in outcome.items() if name in n)["ok"]
     combined = data["combined"][0]
-    factor, product = combined["contrast_variance"]["mbir_factor_roi_bowtie"], combined["contrast_variance"]
+    factor, product = (
+        combined["contrast_variance"]["mbir_factor_roi_bowtie"],
+        combined["contrast_variance"],
+    )
     assert product["fbp_ratio_roi_to_large"] == pytest.approx(1.0, abs=5e-3)
     assert factor == pytest.approx(product["mbir_factor_large_bowtie"], rel=0.05)
     saved = 1.0 / data["ctdi_ratios"]["plane"]["weighted"]

@@ -41,7 +41,10 @@ def test_a_page_has_its_tables_and_pictures_in_it():
 
 
 def test_tables_are_aligned():
-    text = aligned("text | no table\n\n| a | bb |\n|--|--|\n| long name | 1 |\n| x | |\n| a \\| b | 22 |\n\nend")
+    text = aligned(
+        "text | no table\n\n| a | bb |\n|--|--|\n| long name | 1 |\n| x | |\n| a \\| b | 22 "
+        "|\n\nend"
+    )
     assert text.startswith("text | no table\n\n| a ")
     lines = text.splitlines()[2:-2]
     assert len({len(line) for line in lines}) == 1
@@ -49,8 +52,16 @@ def test_tables_are_aligned():
 
 
 def record(method, exposure, figure, where, value, low=math.nan, high=math.nan):
-    return {"task": "plaque", "method": method, "exposure_s": exposure, "figure": figure, "where": where,
-            "value": value, "low": low, "high": high}  # fmt: skip
+    return {
+        "task": "plaque",
+        "method": method,
+        "exposure_s": exposure,
+        "figure": figure,
+        "where": where,
+        "value": value,
+        "low": low,
+        "high": high,
+    }
 
 
 def report_values(low, high, exposures=(0.35, 2.0)):
@@ -61,8 +72,18 @@ def report_values(low, high, exposures=(0.35, 2.0)):
             record("mbir", e, "dose factor: CNR", "small", 5.55, low, high),
             record("mbir", e, "dose factor: contrast at slope 1", "lesion", 0.85, 0.8, 0.9),
         ]
-    settings = {"views": 1968, "n": 16, "methods": ["fbp:soft", "mbir"], "exposures_s": list(exposures)}
-    return {"settings": settings, "records": records, "claim": claim(records), "reference": "fbp:soft"}
+    settings = {
+        "views": 1968,
+        "n": 16,
+        "methods": ["fbp:soft", "mbir"],
+        "exposures_s": list(exposures),
+    }
+    return {
+        "settings": settings,
+        "records": records,
+        "claim": claim(records),
+        "reference": "fbp:soft",
+    }
 
 
 def answer(data):
@@ -91,9 +112,12 @@ def test_the_answer_is_one_sentence_made_of_the_results(low, high, expected_text
 
 
 def test_the_page_begins_with_the_answer_in_three_sentences():
-    """Then the pictures and one table, which is narrow; what follows is for those who ask for more."""
+    """Then the pictures and one table, which is narrow; what follows is for those who ask for
+    more."""
     data = report_values(2.0, 5.6)
-    data["records"].append(record("pwls", 2.0, "dose factor: contrast at slope 1", "lesion", 1.06, 1.01, 1.11))
+    data["records"].append(
+        record("pwls", 2.0, "dose factor: contrast at slope 1", "lesion", 1.06, 1.01, 1.11)
+    )
     data |= {"tables": "THE REST", "seconds": {}, "peak_memory_gib": 1.0}
     top, rest = render("compare", data).split("\n---\n")
     assert "THE REST" in rest
@@ -127,7 +151,12 @@ def test_the_chart_draws_every_factor_that_was_measured():
     settings = SimpleNamespace(**data["settings"])
     axes = dose_chart(data["records"], settings).axes
     points = [
-        [line.get_xdata()[0] for line in a.lines if line.get_marker() == "o" and len(line.get_xdata())] for a in axes
+        [
+            line.get_xdata()[0]
+            for line in a.lines
+            if line.get_marker() == "o" and len(line.get_xdata())
+        ]
+        for a in axes
     ]
     assert points == [[5.55, 5.55], [0.85, 0.85], []]
 

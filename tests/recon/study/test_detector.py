@@ -9,7 +9,9 @@ from torchpcct.scanner.compton import recoil
 
 
 def test_report(tiny, tmp_path):
-    data = assert_report_is_whole(tiny("detector"), tmp_path, {"detector.png"}, ("## Charge sharing", "## Pile-up"))
+    data = assert_report_is_whole(
+        tiny("detector"), tmp_path, {"detector.png"}, ("## Charge sharing", "## Pile-up")
+    )
     checks = {c["name"]: c for c in data["checks"]}
     assert checks["counted / incident behind 24 cm fat"]["ok"]
     assert checks["pile-up behind the body, calibrated, HU"]["ok"]
@@ -19,7 +21,8 @@ def test_report(tiny, tmp_path):
     entry = data["pile_up"][0]
     assert entry["air"]["lost_percent"] > 40 > 2 > entry["body"]["lost_percent"] > 0.5
     assert abs(entry["uncorrected_body_hu"]) > 100
-    # A split pulse counts twice more often than never: counts rise while photons and efficiency are lost.
+    # A split pulse counts twice more often than never: counts rise while photons and efficiency are
+    # lost.
     shared = data["charge_sharing"][0]
     assert shared["photons_percent"] < 0 < shared["counts_percent"]
     text = tiny("detector").report.text
@@ -34,7 +37,9 @@ def test_photons_of_which_a_part_counts_are_those_of_drawn_splits():
     for k, energy in enumerate(energies):
         photo, compton = (float(p[0]) for p in detector.interaction([energy]))
         electron, chance = (a[0] for a in recoil(np.array([energy])))
-        deposit = np.where(rng.random(n) < photo / (photo + compton), energy, rng.choice(electron, n, p=chance))
+        deposit = np.where(
+            rng.random(n) < photo / (photo + compton), energy, rng.choice(electron, n, p=chance)
+        )
         part = np.where(rng.random(n) < 0.3, rng.random(n), 1.0)
         parts = np.stack([part * deposit, (1 - part) * deposit])
         parts += detector.sigma_kev * rng.standard_normal(parts.shape)

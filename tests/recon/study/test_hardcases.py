@@ -60,7 +60,9 @@ def test_metal_is_named_and_its_own_voxels_do_not_count(tiny):
     assert any("metal" in text for text in rows["metal"]["messages"])
     # The rod reads 16 000 HU: counted, it would be an error of more than a thousand.
     assert rows["metal"]["error_hu"] < 2 * rows["sound"]["noise_hu"]
-    assert rows["sound"]["soft_hu"] < rows["sound"]["truth_hu"] < 1.2 * rows["sound"]["noise_hu"] + 20
+    assert (
+        rows["sound"]["soft_hu"] < rows["sound"]["truth_hu"] < 1.2 * rows["sound"]["noise_hu"] + 20
+    )
     assert rows["three-views"]["truth_hu"] is rows["three-views"]["soft_hu"] is None
 
 
@@ -68,7 +70,10 @@ def test_only_what_a_case_adds_is_left_out():
     scene, plaque = plaque_scene(vessel_length=6.2)
     grid = VolumeGrid((4, 23, 23), 0.4, plaque.position[::-1])
     assert untouched(scene, scene, grid).all()
-    for name, volume in (("metal", math.pi * 0.6**2 * 1.6), ("dynamic-range", math.pi * 0.6**2 * 1.6)):
+    for name, volume in (
+        ("metal", math.pi * 0.6**2 * 1.6),
+        ("dynamic-range", math.pi * 0.6**2 * 1.6),
+    ):
         with_rod = CASES[name].scene(plaque)
         seen = untouched(with_rod, scene, grid)
         share = with_rod.volume_fractions(grid)[with_rod.index("implant")]
@@ -80,7 +85,11 @@ def test_only_what_a_case_adds_is_left_out():
 
 @pytest.mark.extended
 def test_the_report_counts_silent_errors(tiny):
-    assert tiny.report.data["silent"] == 0 == sum(r["verdict"] == "SILENT" for r in tiny.measured.data["rows"])
+    assert (
+        tiny.report.data["silent"]
+        == 0
+        == sum(r["verdict"] == "SILENT" for r in tiny.measured.data["rows"])
+    )
     assert f"**Silent errors: {tiny.report.data['silent']}** of 8" in tiny.report.text
     assert "a dead column" in tiny.report.text
 

@@ -56,12 +56,18 @@ def test_motion_spoils_and_its_knowledge_repairs(tiny):
     assert fixed["lumen_mm2"] == pytest.approx(rest, rel=0.02)
     assert m.compensated["pwls", 0.0, False][0]["nrmse"] < 0.1 * large[0]["nrmse"]
     assert m.compensated["pwls", None, False][0]["nrmse"] == 0.0
-    assert ("pwls", 0.2, False) not in m.compensated  # to its certified minimum with the true motion only
+    # to its certified minimum with the true motion only
+    assert ("pwls", 0.2, False) not in m.compensated
 
 
 def test_report(tiny, tmp_path):
     study = tiny("motion")
-    sections = ("one view in 24", "wrong by 20 %", "## Agreement with the paper", "## What was modelled")
+    sections = (
+        "one view in 24",
+        "wrong by 20 %",
+        "## Agreement with the paper",
+        "## What was modelled",
+    )
     data = assert_report_is_whole(study, tmp_path, {"motion.png", "motion_images.png"}, sections)
     assert "segmentation finds it" in study.report.text
     assert {"range [0, A]", "EID-CT less sensitive"} <= {c["paper"] for c in data["checks"]}

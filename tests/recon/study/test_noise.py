@@ -1,4 +1,5 @@
-"""The noise study: exact moments, realisations without reconstruction, and what few runs establish."""
+"""The noise study: exact moments, realisations without reconstruction, and what few runs
+establish."""
 
 import itertools
 from dataclasses import replace
@@ -34,7 +35,7 @@ def measured(tiny):
     return tiny("noise").measured.seen
 
 
-# --- the study ----------------------------------------------------------------------------------------------------
+# --- the study ------------------------------------------------------------------------------------
 
 
 def test_realisations_without_reconstruction_are_those_of_fbp(tiny):
@@ -48,7 +49,11 @@ AXES = Settings(**TINY["noise"]).axes
 
 def test_joint_covariance_holds_the_covariances_of_every_setting(measured):
     scanned = measured.scanned
-    single = list(itertools.chain.from_iterable(roi_covariance(scanned.clean, scanned.fbp, scanned.pairs, 1.0)))
+    single = list(
+        itertools.chain.from_iterable(
+            roi_covariance(scanned.clean, scanned.fbp, scanned.pairs, 1.0)
+        )
+    )
     joint = measured.covariance
     assert [(k, v) for v in (0.25, 0.40) for k in ("soft", "bone")] == AXES
     for i, matrix in enumerate(single):
@@ -58,7 +63,8 @@ def test_joint_covariance_holds_the_covariances_of_every_setting(measured):
 
 
 def test_realisations_follow_the_exact_law(measured):
-    """Whitened by the exact covariance, the deviations are standard normal: χ² of all settings together."""
+    """Whitened by the exact covariance, the deviations are standard normal: χ² of all settings
+    together."""
     for exposure, values in measured.means.items():
         deviation = (values - measured.expected).reshape(len(values), -1)
         root = np.linalg.cholesky(measured.covariance / exposure)
@@ -73,7 +79,11 @@ def test_adjoint_vectors_of_the_grids_share_one_window(measured):
     assert adjoints.matrix.shape[0] == 8
     assert adjoints.window.rows < scanned.clean.window.rows
     whole = replace(
-        scanned.clean, counts=torch.ones(scanned.clean.geometry.shape), window=None, surround=None, region=None
+        scanned.clean,
+        counts=torch.ones(scanned.clean.geometry.shape),
+        window=None,
+        surround=None,
+        region=None,
     )
     with pytest.raises(ValueError, match="windowed"):
         whole.crop(adjoints.window)
@@ -91,7 +101,9 @@ def test_covariance_of_a_voxel_is_that_of_two_functionals(measured):
     assert found.shape == grid.shape
     singles = torch.zeros(2, *grid.shape, dtype=torch.float64)
     singles[0][here] = singles[1][there] = 1.0
-    ((exact,),) = roi_covariance(scanned.clean, fbp, [[SimpleNamespace(weights=w) for w in singles]], 2.0)
+    ((exact,),) = roi_covariance(
+        scanned.clean, fbp, [[SimpleNamespace(weights=w) for w in singles]], 2.0
+    )
     assert [float(found[here]), float(found[there])] == pytest.approx(exact[0].tolist(), rel=1e-3)
     with pytest.raises(ValueError, match="one grid with one kernel"):
         voxel_covariance(scanned.clean, scanned.fbp, 2.0, here)
@@ -105,17 +117,21 @@ def test_noise_falls_with_the_square_root_of_dose(tiny):
 
 def test_report(tiny, tmp_path):
     sections = ("## Which rankings are established", "## Agreement", "## What was modelled")
-    data = assert_report_is_whole(tiny("noise"), tmp_path, {"noise_images.png", "noise_cnr.png"}, sections)
+    data = assert_report_is_whole(
+        tiny("noise"), tmp_path, {"noise_images.png", "noise_cnr.png"}, sections
+    )
     assert len(data["doses"]["1x"]) == 4
     assert data["pairs"]["pairs"] == 6
     assert sum(data["ten_run_experiments"]["winners"].values()) == pytest.approx(1.0)
     means = tiny("noise").measured.seen.means[2.0][:10, 1]  # of the first ten runs, bone at 0.25 mm
     row = data["doses"]["5.7x"][1]["ten_runs"]
-    assert row["cnr"] == pytest.approx((means[:, 1] - means[:, 0]).mean() / np.hypot(*means.std(0, ddof=1)))
+    assert row["cnr"] == pytest.approx(
+        (means[:, 1] - means[:, 0]).mean() / np.hypot(*means.std(0, ddof=1))
+    )
     assert row["cnr_interval"][0] < row["cnr"] < row["cnr_interval"][1]
 
 
-# --- statistics ---------------------------------------------------------------------------------------------------
+# --- statistics -----------------------------------------------------------------------------------
 
 MEAN = np.array([[40.0, 90.0], [45.0, 95.0], [50.0, 85.0]])
 
@@ -137,7 +153,9 @@ def test_few_run_tables_have_the_moments_of_their_law():
     np.testing.assert_allclose((table.sd**2).mean(0), sd**2, rtol=0.02)
     # The mean of ten correlated runs keeps their correlation.
     flat = table.mean.reshape(-1, 6)
-    np.testing.assert_allclose(np.cov(flat.T), covariance / 10, atol=0.03 * np.trace(covariance) / 10)
+    np.testing.assert_allclose(
+        np.cov(flat.T), covariance / 10, atol=0.03 * np.trace(covariance) / 10
+    )
 
 
 def test_resampled_tables_are_the_tables_of_resamples():

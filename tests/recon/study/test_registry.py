@@ -23,17 +23,28 @@ def test_a_check_is_inside_its_closed_range_only():
 
 
 def test_checks_as_json_values_and_as_text():
-    checks = [around("size, mm", 1.97, 1.97, 0.02), Check("dice", 0.2, "visible", low=0.5, note="noise")]
+    checks = [
+        around("size, mm", 1.97, 1.97, 0.02),
+        Check("dice", 0.2, "visible", low=0.5, note="noise"),
+    ]
     assert checks[1].as_dict() == {
-        "name": "dice", "ours": 0.2, "paper": "visible", "low": 0.5, "high": None, "note": "noise", "ok": False,
-    }  # fmt: skip
+        "name": "dice",
+        "ours": 0.2,
+        "paper": "visible",
+        "low": 0.5,
+        "high": None,
+        "note": "noise",
+        "ok": False,
+    }
     found = [c.as_dict() for c in checks]
     text = rendered("{{ parts.checks(found) }}", found=found)
     assert "1 of 2 checks" in text
     assert "size, mm" in text
     assert "≥ 0.5" in text
     assert "size, mm" not in rendered("{{ parts.checks(found, every=false) }}", found=found)
-    assert "not found" in rendered("{{ parts.checks(found) }}", found=[Check("x", math.nan, 1.0).as_dict()])
+    assert "not found" in rendered(
+        "{{ parts.checks(found) }}", found=[Check("x", math.nan, 1.0).as_dict()]
+    )
 
 
 def test_effects_say_what_is_modelled():
@@ -49,7 +60,11 @@ def test_effects_say_what_is_modelled():
 
 def rendered(text, **data):
     """A template with what reports share."""
-    return templates(TEMPLATES).from_string('{% import "parts.md.j2" as parts %}' + text).render(**data)
+    return (
+        templates(TEMPLATES)
+        .from_string('{% import "parts.md.j2" as parts %}' + text)
+        .render(**data)
+    )
 
 
 def test_a_missing_value_is_an_error_and_no_gap():
@@ -58,16 +73,23 @@ def test_a_missing_value_is_an_error_and_no_gap():
 
 
 COUNTS = {
-    "compare": "views", "detector": "photons", "bowtie": "views", "hardcases": "views",
+    "compare": "views",
+    "detector": "photons",
+    "bowtie": "views",
+    "hardcases": "views",
     "motion": "thinning",
-    "noise": "views", "phantom": "sections", "resolution": "thinning", "spectral": "views",
-}  # fmt: skip
+    "noise": "views",
+    "phantom": "sections",
+    "resolution": "thinning",
+    "spectral": "views",
+}
 """Study → a field that counts something."""
 
 
 @pytest.mark.parametrize("name", registry.STUDIES)
 def test_settings_of_every_study(name):
-    """Valid as they are, as a first look and at the smallest scale; nonsense is refused by its name."""
+    """Valid as they are, as a first look and at the smallest scale; nonsense is refused by its
+    name."""
     full, quick = (registry.build_settings(name, quick=q, seed=3) for q in (False, True))
     assert full != quick
     kind = type(full)
@@ -85,7 +107,10 @@ def test_settings_of_every_study(name):
     refused(
         (COUNTS[name], lambda: kind(**{COUNTS[name]: 0})),
         (COUNTS[name], lambda: kind(**{COUNTS[name]: 48.5})),
-        ("nonsense=1.*: give field=value", lambda: registry.build_settings(name, changes=["nonsense=1"])),
+        (
+            "nonsense=1.*: give field=value",
+            lambda: registry.build_settings(name, changes=["nonsense=1"]),
+        ),
         ("=.*: give field=value", lambda: registry.build_settings(name, changes=["="])),
         ("views.*: give field=value", lambda: registry.build_settings(name, changes=["views"])),
         ("settings must be", lambda: registry.run(name, other)),
@@ -98,47 +123,73 @@ BAD = {
     "compare": [({"n": 7}, "n must be at least 8"), ({"methods": ()}, "at least one method")],
     "phantom": [({"voxel_mm": 0.5}, "voxel_mm"), ({"energies_kev": (10.0,)}, "energies_kev")],
     "detector": [
-        ({"photons": 10}, "photons"), ({"dead_times_ns": ()}, "dead_times"),
+        ({"photons": 10}, "photons"),
+        ({"dead_times_ns": ()}, "dead_times"),
         ({"charge_sharing": (0.0,)}, "charge_sharing"),
     ],
     "bowtie": [
-        ({"views": 4}, "views"), ({"realizations": 1}, "realizations"), ({"histories": 10}, "histories"),
-        ({"exposure_s": 0.0}, "exposure_s"), ({"map_mm": math.nan}, "map_mm"), ({"plaque_doses": ()}, "plaque_doses"),
-        ({"plaque_realizations": 7}, "plaque_realizations"), ({"detector": "film"}, "detector"),
+        ({"views": 4}, "views"),
+        ({"realizations": 1}, "realizations"),
+        ({"histories": 10}, "histories"),
+        ({"exposure_s": 0.0}, "exposure_s"),
+        ({"map_mm": math.nan}, "map_mm"),
+        ({"plaque_doses": ()}, "plaque_doses"),
+        ({"plaque_realizations": 7}, "plaque_realizations"),
+        ({"detector": "film"}, "detector"),
     ],
-    "hardcases": [({"cases": ("x",)}, "unknown case 'x'"), ({"methods": "fbp"}, "methods must be one name or more")],
+    "hardcases": [
+        ({"cases": ("x",)}, "unknown case 'x'"),
+        ({"methods": "fbp"}, "methods must be one name or more"),
+    ],
     "motion": [
-        ({"voxel_mm": 0.0}, "voxel_mm"), ({"fractions": (0.4, 0.2)}, "fractions must rise"),
-        ({"fractions": ()}, "at least one"), ({"errors": (1.5,)}, "errors must rise"),
-        ({"methods": ("pwls",)}, "must hold fbp"), ({"methods": ("fbp", "tv")}, "must hold fbp"),
+        ({"voxel_mm": 0.0}, "voxel_mm"),
+        ({"fractions": (0.4, 0.2)}, "fractions must rise"),
+        ({"fractions": ()}, "at least one"),
+        ({"errors": (1.5,)}, "errors must rise"),
+        ({"methods": ("pwls",)}, "must hold fbp"),
+        ({"methods": ("fbp", "tv")}, "must hold fbp"),
     ],
     "noise": [
-        ({"realizations": 9}, "realizations"), ({"views": 4}, "views"), ({"doses": {"1x": 1.0}}, "two exposures"),
-        ({"kernels": ("soft",), "voxels_mm": (0.2,)}, "two settings"), ({"experiments": 1}, "experiments"),
+        ({"realizations": 9}, "realizations"),
+        ({"views": 4}, "views"),
+        ({"doses": {"1x": 1.0}}, "two exposures"),
+        ({"kernels": ("soft",), "voxels_mm": (0.2,)}, "two settings"),
+        ({"experiments": 1}, "experiments"),
         ({"reconstructed": 0}, "reconstructed"),
     ],
     "resolution": [
-        ({"sigmas_px": (1.0, 2.0, 3.0)}, "rise from 0"), ({"sigmas_px": (0.0, 2.0, 1.0)}, "rise from 0"),
-        ({"tolerance": 1.5}, "tolerance"), ({"exposure_s": 0.0}, "exposure_s"),
+        ({"sigmas_px": (1.0, 2.0, 3.0)}, "rise from 0"),
+        ({"sigmas_px": (0.0, 2.0, 1.0)}, "rise from 0"),
+        ({"tolerance": 1.5}, "tolerance"),
+        ({"exposure_s": 0.0}, "exposure_s"),
     ],
     "spectral": [
-        ({"exposure_s": 0.0}, "exposure_s"), ({"realizations": 0}, "realizations"), ({"views": 10}, "views"),
-        ({"mbir_realizations": 9}, "mbir_realizations"), ({"noise_levels": (0.25, 1.0)}, "ascend from 0"),
-        ({"noise_levels": (0.0, 1.0, 0.5)}, "ascend from 0"), ({"calibration_views": 8}, "calibration_views"),
-        ({"transport_photons": 10}, "transport_photons"), ({"threshold_error_kev": 9.0}, "threshold_error_kev"),
+        ({"exposure_s": 0.0}, "exposure_s"),
+        ({"realizations": 0}, "realizations"),
+        ({"views": 10}, "views"),
+        ({"mbir_realizations": 9}, "mbir_realizations"),
+        ({"noise_levels": (0.25, 1.0)}, "ascend from 0"),
+        ({"noise_levels": (0.0, 1.0, 0.5)}, "ascend from 0"),
+        ({"calibration_views": 8}, "calibration_views"),
+        ({"transport_photons": 10}, "transport_photons"),
+        ({"threshold_error_kev": 9.0}, "threshold_error_kev"),
     ],
-}  # fmt: skip
+}
 """Study → changes of its settings that it refuses, and in which words."""
 
 
-@pytest.mark.parametrize(("name", "change", "match"), [(n, *case) for n, cases in BAD.items() for case in cases])
+@pytest.mark.parametrize(
+    ("name", "change", "match"), [(n, *case) for n, cases in BAD.items() for case in cases]
+)
 def test_bad_settings(name, change, match):
     with pytest.raises(ValueError, match=match):
         registry.part(name).Settings(**change)
 
 
 def test_changes_from_the_command_line():
-    settings = registry.build_settings("compare", quick=True, changes=["views=96", "methods=['fbp:bone']"])
+    settings = registry.build_settings(
+        "compare", quick=True, changes=["views=96", "methods=['fbp:bone']"]
+    )
     assert (settings.views, settings.methods) == (96, ("fbp:bone",))
 
 

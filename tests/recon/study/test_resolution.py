@@ -1,4 +1,5 @@
-"""The resolution study: its measures against closed forms, its limits, and a whole run at small scale."""
+"""The resolution study: its measures against closed forms, its limits, and a whole run at small
+scale."""
 
 import math
 
@@ -34,7 +35,8 @@ def test_blur_is_gaussian_and_keeps_the_mean():
 
 @pytest.mark.parametrize(("radial", "tangential"), [(0.2, 0.2), (0.25, 0.4)])
 def test_width_of_a_known_point(radial, tangential):
-    """A Gaussian turned along the direction to the isocentre; the wire's own width is taken off in quadrature."""
+    """A Gaussian turned along the direction to the isocentre; the wire's own width is taken off
+    in quadrature."""
     grid = VolumeGrid((121, 121), 0.02, (30.0, 40.0))
     y, x = np.meshgrid(grid.axes[0] - 30.0, grid.axes[1] - 40.0, indexing="ij")
     r, t = 0.6 * y + 0.8 * x, 0.8 * y - 0.6 * x
@@ -60,7 +62,9 @@ def test_where_the_plaque_is(plaque):
     for point, name in zip(truth.line, ("lumen", "core"), strict=True):
         mask = truth.masks[name]
         assert mask.sum() * 0.035**2 == pytest.approx(float(shape.area(name)), rel=0.01)
-        index = [round((p - a[0]) / 0.035) for p, a in zip(point, truth.image.axes[1:], strict=True)]
+        index = [
+            round((p - a[0]) / 0.035) for p, a in zip(point, truth.image.axes[1:], strict=True)
+        ]
         assert mask[tuple(index)]
 
 
@@ -69,7 +73,9 @@ def test_a_disc_is_found_where_it_is():
     y, x = np.meshgrid(*grid.slice.axes, indexing="ij")
     disc = np.hypot(y - 0.1, x - 0.2) < 1.0
     image = torch.from_numpy(np.where(disc, 500.0, -100.0))
-    found = measure_plaque(image, Truth(grid, {"lumen": disc, "core": disc}, ((0.1, 0.2), (0.1, 2.2))))
+    found = measure_plaque(
+        image, Truth(grid, {"lumen": disc, "core": disc}, ((0.1, 0.2), (0.1, 2.2)))
+    )
     assert found["lumen_dice"] == 1.0
     assert found["core_dice"] == 0.0
     assert found["lumen_mm2"] == pytest.approx(math.pi, rel=0.01)
@@ -104,7 +110,8 @@ def test_blur_takes_cap_core_and_lumen(series):
 
 
 def test_a_thicker_blur_before_is_a_thinner_blur_after(plaque, series):
-    """Gaussians add in quadrature: the sharper system bears a wider blur before it shows the same."""
+    """Gaussians add in quadrature: the sharper system bears a wider blur before it shows the
+    same."""
     direct = measure_plaque(_ideal(plaque, math.hypot(4.0, 5.0)), plaque[2])
     twice = next(b for b in series if b["sigma_px"] == 5.0)
     assert twice["cap_line_mm"] == pytest.approx(direct["cap_line_mm"], abs=0.002)
@@ -129,10 +136,21 @@ def test_the_scanners(tiny):
 def test_report(tiny, tmp_path):
     """Every row of the list is there; a core that is lost early names its cause."""
     study = tiny("resolution")
-    sections = ("## The two scanners", "## PCCT under blur", "## Agreement with the paper", "## What was modelled")
-    data = assert_report_is_whole(study, tmp_path, {"resolution.png", "resolution_images.png"}, sections)
+    sections = (
+        "## The two scanners",
+        "## PCCT under blur",
+        "## Agreement with the paper",
+        "## What was modelled",
+    )
+    data = assert_report_is_whole(
+        study, tmp_path, {"resolution.png", "resolution_images.png"}, sections
+    )
     assert len(data["checks"]) == 13
-    assert all(c["note"] for c in data["checks"] if not c["ok"] and ("rim" in c["name"] or "CNR" in c["name"]))
+    assert all(
+        c["note"]
+        for c in data["checks"]
+        if not c["ok"] and ("rim" in c["name"] or "CNR" in c["name"])
+    )
     width = data["scanners"]["PCCT"]["fwhm_mm"]["area"]
     assert data["final_fwhm_mm"] == pytest.approx(math.hypot(width, data["margin_fwhm_mm"]))
     # The report says what the criterion starts from, in a word of the figure's sign.

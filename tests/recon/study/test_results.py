@@ -8,9 +8,20 @@ import pytest
 
 from recon.study.results import README_MARKS, differences, render
 
-DATA = {"rows": [{"m": "a", "s": 2.0, "v": 1.234}, {"m": "b", "s": 2.0, "v": [5.0, 6.6]}], "n": {"k": 200}}
-RECORD = {"task": "plaque", "method": "mbir", "exposure_s": 2.0, "figure": "CNR", "where": "small", "value": 1.531,
-          "low": 1.47, "high": 1.594}  # fmt: skip
+DATA = {
+    "rows": [{"m": "a", "s": 2.0, "v": 1.234}, {"m": "b", "s": 2.0, "v": [5.0, 6.6]}],
+    "n": {"k": 200},
+}
+RECORD = {
+    "task": "plaque",
+    "method": "mbir",
+    "exposure_s": 2.0,
+    "figure": "CNR",
+    "where": "small",
+    "value": 1.531,
+    "low": 1.47,
+    "high": 1.594,
+}
 FIRST, LAST = README_MARKS
 
 
@@ -18,7 +29,9 @@ FIRST, LAST = README_MARKS
 def root(tmp_path):
     folder = tmp_path / "notebooks" / "r"
     folder.mkdir(parents=True)
-    (folder / "report.json").write_text(json.dumps({**DATA, "records": [RECORD], "shift": -4.6}), encoding="utf-8")
+    (folder / "report.json").write_text(
+        json.dumps({**DATA, "records": [RECORD], "shift": -4.6}), encoding="utf-8"
+    )
     (tmp_path / "README.md").write_text(f"# T\n\n{FIRST}\nold\n{LAST}\n\nend\n", encoding="utf-8")
     return tmp_path
 
@@ -42,7 +55,10 @@ def rendered(root, text):
         ('{{ (r.rows|row(m="a")).v|f(".1f") }}× of {{ r.n.k }}', "1.2× of 200"),
         ('{{ r|record("plaque", "mbir", 2, "CNR", "small")|f(".1f") }}', "1.5"),
         ('{{ r|record("plaque", "mbir", 2, "CNR", "small")|interval }}', "1.53 [1.47, 1.59]"),
-        ('it {{ "gains" if r.shift > 0 else "loses" }} {{ r.shift|abs|f(".1f") }} %', "it loses 4.6 %"),
+        (
+            'it {{ "gains" if r.shift > 0 else "loses" }} {{ r.shift|abs|f(".1f") }} %',
+            "it loses 4.6 %",
+        ),
     ],
 )
 def test_fields(root, text, expected_text):
@@ -68,7 +84,9 @@ def test_what_cannot_be_rendered_is_refused(root, text, message):
 def test_the_repository_is_rendered():
     root = Path(__file__).parents[3]
     for name, text in render(root).items():
-        assert (root / name).read_text(encoding="utf-8") == text, f"{name}: torchpcct verify --write"
+        assert (root / name).read_text(encoding="utf-8") == text, (
+            f"{name}: torchpcct verify --write"
+        )
 
 
 def test_differences_are_named_and_runs_may_take_another_time():
@@ -81,4 +99,8 @@ def test_differences_are_named_and_runs_may_take_another_time():
     again["rows"][0]["v"] *= 1.01
     again["rows"][1]["m"] = "c"
     del again["n"]["k"]
-    assert [line.split(":")[0] for line in differences(DATA, again)] == ["/n/k", "/rows/0/v", "/rows/1/m"]
+    assert [line.split(":")[0] for line in differences(DATA, again)] == [
+        "/n/k",
+        "/rows/0/v",
+        "/rows/1/m",
+    ]

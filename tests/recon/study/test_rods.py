@@ -1,4 +1,5 @@
-"""True tissue values by rods: against the spectrum behind the patient, and what they must not depend on."""
+"""True tissue values by rods: against the spectrum behind the patient, and what they must not
+depend on."""
 
 import pytest
 
@@ -26,7 +27,8 @@ def materials(setup, *names):
 
 @pytest.mark.extended
 def test_ct_numbers_behind_the_patient(setup, found):
-    """Material.hu behind the cylinder refers to water behind fat, FBP to water alone: a shift of a few HU."""
+    """Material.hu behind the cylinder refers to water behind fat, FBP to water alone: a shift of
+    a few HU."""
     scene, scanner, _ = setup
     energies, weights = scanner.weights()
     column = weights.shape[1] // 2
@@ -35,7 +37,9 @@ def test_ct_numbers_behind_the_patient(setup, found):
     for body in scene.bodies:
         expected = MATERIALS[body.material].hu(energies, behind)
         assert 0 < found[body.name] - expected < (8 if body.name != "lumen" else 20), body.name
-    core, fibrous = (MATERIALS[scene[name].material].hu(energies, behind) for name in ("core", "fibrous"))
+    core, fibrous = (
+        MATERIALS[scene[name].material].hu(energies, behind) for name in ("core", "fibrous")
+    )
     assert found["fibrous"] - found["core"] == pytest.approx(fibrous - core, abs=1.5)
 
 

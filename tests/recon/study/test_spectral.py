@@ -54,7 +54,8 @@ def test_physics_that_holds_at_any_scale(tiny):
 
 @pytest.mark.extended
 def test_mbir_is_less_noisy_than_fbp(tiny):
-    """The gantry turns 6° in each of so few views and smears the vessel: only the fat can be judged."""
+    """The gantry turns 6° in each of so few views and smears the vessel: only the fat can be
+    judged."""
     data = tiny("spectral").measured.data
     noisy = data["mbir"]["at_best_energy"][-1]
     assert noisy["noise"] == 1.0
@@ -77,14 +78,22 @@ def test_checks_name_what_fails(tiny):
 
 @pytest.mark.extended
 def test_no_error_costs_nothing(tiny, monkeypatch):
-    """Wrong calibrations of zero size, through the whole chain: every cost is 0 in HU and in Dice."""
+    """Wrong calibrations of zero size, through the whole chain: every cost is 0 in HU and in
+    Dice."""
     # One bin stands for all of them.
-    monkeypatch.setattr(calibration, "calibration_cases", lambda settings, bins: calibration_cases(settings, 1))
+    monkeypatch.setattr(
+        calibration, "calibration_cases", lambda settings, bins: calibration_cases(settings, 1)
+    )
     settings = replace(
-        tiny("spectral").measured.settings, threshold_error_kev=0.0, voltage_error_kv=0.0, gain_error=0.0,
+        tiny("spectral").measured.settings,
+        threshold_error_kev=0.0,
+        voltage_error_kv=0.0,
+        gain_error=0.0,
         transport_photons=0,
-    )  # fmt: skip
-    costs = calibration_costs(settings, tiny("spectral").measured.seen.tissues, lambda fraction: None)
+    )
+    costs = calibration_costs(
+        settings, tiny("spectral").measured.seen.tissues, lambda fraction: None
+    )
     assert len(costs["cases"]) == 7
     for case in costs["cases"]:
         assert case["failed"] == 0.0
@@ -98,14 +107,19 @@ def test_wrong_calibrations_cost(tiny):
     """Signs and sizes that follow without the study's own code."""
     found = {c["name"]: c for c in tiny("spectral").measured.data["calibration"]["cases"]}
     assert found["none"]["failed"] == 0.0
-    # 1 % more counts: the line integrals fall by 0.01, evenly; of the patient's 240 mm of fat that is 2.3 per mille.
+    # 1 % more counts: the line integrals fall by 0.01, evenly; of the patient's 240 mm of fat that
+    # is 2.3 per mille.
     for energy in SHOWN_KEV:
         more = found["1 % more counts in all bins"]["cost_hu"][f"{energy:g}"]
         assert more["fat"] < 0
         assert more["fat"] == pytest.approx(more["core"], abs=0.3)
-    # One bin in eight costs less than all of them, and the air scan takes most of an error of the spectrum.
+    # One bin in eight costs less than all of them, and the air scan takes most of an error of the
+    # spectrum.
     level = {name: abs(c["cost_hu"]["70"]["fat"]) for name, c in found.items()}
-    assert max(level[f"1 % more counts in bin {k}"] for k in range(1, 9)) < level["1 % more counts in all bins"]
+    assert (
+        max(level[f"1 % more counts in bin {k}"] for k in range(1, 9))
+        < level["1 % more counts in all bins"]
+    )
     assert level["tube voltage 2 kV lower"] < 0.5 * level["tube voltage 2 kV lower, no air scan"]
     assert level["thresholds 2 keV lower"] > 2.0
     # What repeated interactions cost is gone once the decomposition knows their response.
@@ -119,7 +133,9 @@ def test_wrong_calibrations_cost(tiny):
 def test_twice_the_error_costs_more(tiny):
     """Small errors cost in proportion."""
     scan = tiny("spectral").measured.seen.scan
-    lines = [decomposed(scan, CalibrationError("x", gain=g), scan.scanner)[0] for g in (0.0, 0.005, 0.01)]
+    lines = [
+        decomposed(scan, CalibrationError("x", gain=g), scan.scanner)[0] for g in (0.0, 0.005, 0.01)
+    ]
     small, large = (vmi(images - lines[0], scan.basis, [70.0]) for images in lines[1:])
     zero = vmi(torch.zeros_like(lines[0]), scan.basis, [70.0])
     ratio = float((large - zero).mean() / (small - zero).mean())
@@ -144,7 +160,10 @@ def test_what_joint_mbir_does_to_the_contrast_is_said_by_its_sign(tiny):
     data = json.loads(tiny("spectral").report.json)
     clean = data["mbir"]["at_best_energy"][0]
     clean["FBP"] |= {"core_hu": 40.0, "fibrous_hu": 100.0}
-    for joint, words in ((90.0, ("pays with contrast", "17 % less")), (112.0, ("gains contrast", "20 % more"))):
+    for joint, words in (
+        (90.0, ("pays with contrast", "17 % less")),
+        (112.0, ("gains contrast", "20 % more")),
+    ):
         clean["joint MBIR"] |= {"core_hu": 40.0, "fibrous_hu": joint}
         text = render("spectral", data)
         assert all(word in text for word in words)

@@ -11,7 +11,14 @@ from torchpcct.acquisition.acquire import acquire, plan
 from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, compress, sub_rays
 from torchpcct.geometry import ConeBeam, VolumeGrid, full_turn
 from torchpcct.scanner import SiliconDetector, presets
-from torchpcct.scene import Body, Ellipsoid, EllipticCylinder, Scene, SinusoidalMotion, chord_lengths
+from torchpcct.scene import (
+    Body,
+    Ellipsoid,
+    EllipticCylinder,
+    Scene,
+    SinusoidalMotion,
+    chord_lengths,
+)
 from torchpcct.scene.phantoms.quality import water_cylinder
 from torchpcct.scene.plaque import plaque_scene
 from torchpcct.scene.plaque.variants import plaque_variant
@@ -59,7 +66,8 @@ def test_an_interrupted_scan_goes_on_with_what_was_kept(plaque):
 
 
 def reference_line_integrals(scene, scan_system, cells, duty, count, rng):
-    """Brute force: every sub-ray of a reading is a random beam sample, every energy is summed. ``cells`` (N, 3)."""
+    """Brute force: every sub-ray of a reading is a random beam sample, every energy is summed.
+    ``cells`` (N, 3)."""
     g = scan_system.geometry
     energies, spectra = scan_system.weights()
     contrast = scene.contrast(energies)
@@ -68,7 +76,9 @@ def reference_line_integrals(scene, scan_system, cells, duty, count, rng):
     result = []
     for view, row, column in cells:
         # Stratified in the five beam coordinates by a shuffled (Latin hypercube) design.
-        x = (np.stack([rng.permutation(count) for _ in range(5)], 1) + rng.random((count, 5))) / count - 0.5
+        x = (
+            np.stack([rng.permutation(count) for _ in range(5)], 1) + rng.random((count, 5))
+        ) / count - 0.5
         beta = g.angles[view] + x[:, 4] * step
         er = np.stack([np.cos(beta), np.sin(beta), 0 * beta], 1)
         et = np.stack([-np.sin(beta), np.cos(beta), 0 * beta], 1)
@@ -87,26 +97,31 @@ def reference_line_integrals(scene, scan_system, cells, duty, count, rng):
 
 
 def compared(scene, scan, seen, cells, rays, seed):
-    """Errors of ``cells`` readings whose inset adds more than a share ``seen`` of its peak; peaks of all and of it."""
+    """Errors of ``cells`` readings whose inset adds more than a share ``seen`` of its peak;
+    peaks of all and of it."""
     polychromatic = (scan._at_window(scan.air.log()) - scan.counts.log()).numpy()
     inset = polychromatic - scan._at_window(scan.air.log() - scan.surround.log()).numpy()
     rng = np.random.default_rng(seed)
     chosen = np.argwhere(inset > seen * inset.max())
     chosen = chosen[rng.choice(len(chosen), cells, replace=False)]
-    at = np.stack([chosen[:, 0], chosen[:, 1], scan.window.first_column[chosen[:, 0]] + chosen[:, 2]], 1)
+    at = np.stack(
+        [chosen[:, 0], chosen[:, 1], scan.window.first_column[chosen[:, 0]] + chosen[:, 2]], 1
+    )
     exact = reference_line_integrals(scene, scanner(), at, 0.02, rays, rng)
     return polychromatic[tuple(chosen.T)] - exact, polychromatic.max(), inset.max()
 
 
 def test_line_integrals_against_brute_force(plaque, clean):
-    """Error at most 1e-3 of the line integral's peak, and rms 1e-3 of what the plaque alone adds to it."""
+    """Error at most 1e-3 of the line integral's peak, and rms 1e-3 of what the plaque alone adds
+    to it."""
     error, peak, inset = compared(plaque[0], clean, 0.002, 60, 6000, 1)
     assert np.abs(error).max() < 1e-3 * peak
     assert np.sqrt(np.mean(error**2)) < 1e-3 * inset
 
 
 def test_metal_edges_against_brute_force():
-    """Thin metal covers a part of a cell: the line integral varies by more than 1 inside it at low energies."""
+    """Thin metal covers a part of a cell: the line integral varies by more than 1 inside it at
+    low energies."""
     scene, _ = plaque_variant("stent")
     scan = acquire(scene, scanner(), region=INSET, duty=0.02)
     assert torch.isfinite(scan.line_integrals()).all()
@@ -119,12 +134,20 @@ PILED_UP = SiliconDetector("spectral", dead_time_ns=50.0)
 
 @pytest.mark.parametrize(
     "system",
-    [scanner(), presets.eid(views=12, rows=4), presets.pcct(views=6, mode="spectral", rows=2, detector=PILED_UP)],
+    [
+        scanner(),
+        presets.eid(views=12, rows=4),
+        presets.pcct(views=6, mode="spectral", rows=2, detector=PILED_UP),
+    ],
     ids=["counting", "energy-integrating", "pile-up"],
 )
 def test_region_is_the_crop_of_the_whole_scan(plaque, system):
-    """Readings, air and noise: a region sees the pile-up, and draws the random numbers, of the whole."""
-    part, whole = (acquire(plaque[0], system, region=region, duty=0.02, sub_rays=16) for region in (INSET, None))
+    """Readings, air and noise: a region sees the pile-up, and draws the random numbers, of the
+    whole."""
+    part, whole = (
+        acquire(plaque[0], system, region=region, duty=0.02, sub_rays=16)
+        for region in (INSET, None)
+    )
     w = part.window
     columns = torch.from_numpy(w.column_indices)[:, None].expand(-1, w.rows, -1)
 
@@ -142,7 +165,9 @@ def test_region_is_the_crop_of_the_whole_scan(plaque, system):
 @pytest.mark.parametrize("make", [presets.pcct, presets.eid])
 def test_a_noisy_scan_is_the_clean_one_with_the_noise_of_its_seed(make):
     system = make(views=16, rows=2)
-    clean, noisy = (acquire(water_cylinder(200.0), system, sub_rays=16, **how) for how in ({}, NOISY))
+    clean, noisy = (
+        acquire(water_cylinder(200.0), system, sub_rays=16, **how) for how in ({}, NOISY)
+    )
     assert clean.counting == (make is presets.pcct)
     assert (noisy.exposure_s, noisy.seed) == (0.35, 4)
     assert torch.equal(noisy.counts, clean.with_noise(0.35, 4).counts)
@@ -150,14 +175,20 @@ def test_a_noisy_scan_is_the_clean_one_with_the_noise_of_its_seed(make):
 
 
 def test_turning_the_object_turns_the_scan():
-    """A scene turned by 30° about the axis, scanned from angles turned by 30°, gives the same readings."""
+    """A scene turned by 30° about the axis, scanned from angles turned by 30°, gives the same
+    readings."""
 
     def scan(turn):
         position = (40 * np.cos(turn), 40 * np.sin(turn), 1.0)
         scene = Scene(
             [
                 Body("water", EllipticCylinder(100.0), "water"),
-                Body("bone", Ellipsoid((5.0, 3.0, 4.0), position=position, rotation=turn), "cortical_bone", "water"),
+                Body(
+                    "bone",
+                    Ellipsoid((5.0, 3.0, 4.0), position=position, rotation=turn),
+                    "cortical_bone",
+                    "water",
+                ),
             ]
         )
         system = scanner(12, 4)
@@ -170,14 +201,24 @@ def test_turning_the_object_turns_the_scan():
 def test_motion_is_exact_in_every_view():
     """A moving body seen in one view reads as the same body standing where it is at that moment."""
     ball = Ellipsoid((4.0, 4.0, 4.0), position=(30.0, 0.0, 0.0))
-    bodies = [Body("fat", EllipticCylinder(100.0), "pericoronary_fat"), Body("ball", ball, "water", "fat")]
+    bodies = [
+        Body("fat", EllipticCylinder(100.0), "pericoronary_fat"),
+        Body("ball", ball, "water", "fat"),
+    ]
     motion = SinusoidalMotion("ball", 2.0)
     system = scanner(16, 2)
-    moving = acquire(Scene(bodies, motion), system, rotation_s=0.35, duty=1e-3, sub_rays=16, tolerance_hu=0)
+    moving = acquire(
+        Scene(bodies, motion), system, rotation_s=0.35, duty=1e-3, sub_rays=16, tolerance_hu=0
+    )
     time = system.geometry.angles[5] / (2 * np.pi) * 0.35
     shift = motion.displacement([time])[0]
     assert abs(shift).max() > 0.5
-    standing = Scene([bodies[0], replace(bodies[1], shape=replace(ball, position=tuple(np.add(ball.position, shift))))])
+    standing = Scene(
+        [
+            bodies[0],
+            replace(bodies[1], shape=replace(ball, position=tuple(np.add(ball.position, shift)))),
+        ]
+    )
     still = acquire(standing, system, duty=1e-3, sub_rays=16, tolerance_hu=0)
     torch.testing.assert_close(moving.counts[5], still.counts[5], rtol=1e-5, atol=0)
     assert not torch.allclose(moving.counts[9], still.counts[9], rtol=1e-4)
@@ -197,7 +238,8 @@ def test_plan_models_only_what_the_scene_needs(plaque):
 
 
 def test_the_plan_says_what_the_detector_does():
-    """Pile-up and charge sharing are modelled exactly if the detector has them, and then the readings show it."""
+    """Pile-up and charge sharing are modelled exactly if the detector has them, and then the
+    readings show it."""
     system = presets.pcct(views=2, rows=1, columns=100, energy_bin_kev=5.0)
 
     def scan(**changes):
@@ -207,7 +249,10 @@ def test_the_plan_says_what_the_detector_does():
 
     effects, ideal = scan()
     assert effects["pile-up, charge sharing"] is False
-    for changes, expected in (({"dead_time_ns": 50.0}, (True, False)), ({"charge_sharing": 0.1}, (False, True))):
+    for changes, expected in (
+        ({"dead_time_ns": 50.0}, (True, False)),
+        ({"charge_sharing": 0.1}, (False, True)),
+    ):
         effects, air = scan(**changes)
         assert (effects["pile-up"], effects["charge sharing"]) == expected
         assert (air != ideal).all()
@@ -272,7 +317,8 @@ SMALL = ConeBeam(full_turn(360), 626.0, 1098.0, 1500, 4, (0.5, 0.35), detector="
     ],
 )
 def test_water_reads_zero(changes):
-    """0 ± 1 HU with the paper's geometry, ± 2 HU when sod, sdd, pitch or offset change; every kernel, off centre."""
+    """0 ± 1 HU with the paper's geometry, ± 2 HU when sod, sdd, pitch or offset change; every
+    kernel, off centre."""
     from recon.analytic.inset import InsetFbp
 
     system = presets.pcct(views=360).replace(geometry=replace(SMALL, **changes))

@@ -1,4 +1,5 @@
-"""Columns: gains and exchanged places are found and measured; what stands on the axis, and sound scans, are not."""
+"""Columns: gains and exchanged places are found and measured; what stands on the axis, and sound
+scans, are not."""
 
 import math
 
@@ -11,7 +12,10 @@ from torchpcct import ConeBeam, FanBeam, ParallelBeam, full_turn
 from torchpcct.checks.columns import GAIN_TOLERANCE, column_test
 
 PHOTONS = 2e4
-BODIES = [Ellipsoid((4.0, -6.0), (55.0, 80.0), value=0.02), Ellipsoid((20.0, -30.0), 14.0, value=0.004)]
+BODIES = [
+    Ellipsoid((4.0, -6.0), (55.0, 80.0), value=0.02),
+    Ellipsoid((20.0, -30.0), 14.0, value=0.004),
+]
 GEOMETRIES = {
     "parallel": ParallelBeam(full_turn(180), 150, 1.4, 0.2),
     "half": ParallelBeam(full_turn(180) / 2, 150, 1.4, 0.2),
@@ -30,8 +34,8 @@ def _lines(g, bodies=BODIES, gains=1.0):
 def test_a_wrong_gain_is_found_and_measured(kind):
     g = GEOMETRIES[kind]
     assert column_test(_lines(g), g).findings == ()
-    # The middle of 150 columns lies 0.64 columns beside the axis: the hardest place. Of part of a turn the object's
-    # edges hide smaller errors.
+    # The middle of 150 columns lies 0.64 columns beside the axis: the hardest place. Of part of a
+    # turn the object's edges hide smaller errors.
     whole = [((75,), 0.95), ((40,), 1.06), ((100, 101), 0.94)]
     for columns, gain in whole if kind in ("parallel", "fan", "cone") else [((85,), 0.9)]:
         gains = np.ones(g.columns)

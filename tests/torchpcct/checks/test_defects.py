@@ -12,7 +12,9 @@ from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, full_turn
 from torchpcct.checks.defects import dead_readings, find_defects, repair_defects
 from torchpcct.scanner.linearisation import WaterLinearisation
 
-VIEWS, ROWS, COLUMNS = 90, 6, 60
+VIEWS = 90
+ROWS = 6
+COLUMNS = 60
 U = np.arange(COLUMNS) - 29.5
 AIR = torch.full((ROWS, COLUMNS), 4000.0)
 
@@ -62,8 +64,16 @@ def test_every_kind_of_defect_is_found_and_nothing_else(counts):
     bad[:, 1, 45] = True
     found = find_defects(broken, AIR)
     assert torch.equal(found.mask, bad)
-    assert (found.dead_cells, found.hot_cells, found.dead_views, found.lost_readings) == (13, 1, 1, 1)
-    assert "13 dead detector cells, 1 cells of a wrong gain, 1 views without signal, 1 single lost" in found.text
+    assert (found.dead_cells, found.hot_cells, found.dead_views, found.lost_readings) == (
+        13,
+        1,
+        1,
+        1,
+    )
+    assert (
+        "13 dead detector cells, 1 cells of a wrong gain, 1 views without signal, 1 single lost"
+        in found.text
+    )
 
 
 @pytest.mark.parametrize(("share", "least"), [(0.001, 0.99), (0.1, 0.99), (0.4, 0.99)])
@@ -76,7 +86,8 @@ def test_readings_lost_at_random_are_found(counts, share, least):
     assert float((found & lost & bright).sum() / (lost & bright).sum()) > least
     # Zeros at the edges of a wide bar of lead are bright on one side only.
     found = find_defects(torch.where(lost, 0.0, behind_lead(8, 10, 26)), AIR).mask
-    assert not (found & ~lost & ~found.all(0)).any()  # single readings: no cell that is left out in all views
+    # single readings: no cell that is left out in all views
+    assert not (found & ~lost & ~found.all(0)).any()
 
 
 def test_a_dead_row_is_found(counts):
@@ -117,7 +128,8 @@ def test_a_scan_is_mended_and_says_so(counts):
 
 
 def foreign(kind, slices):
-    """Readings of every kind of scan over a dark frame of 20, sound and with cells that are dead for a while."""
+    """Readings of every kind of scan over a dark frame of 20, sound and with cells that are dead
+    for a while."""
     geometry = {
         "parallel": ParallelBeam(full_turn(VIEWS) / 2, COLUMNS, 1.0),
         "fan": FanBeam(full_turn(VIEWS), 300.0, 500.0, COLUMNS, 1.0),
@@ -125,14 +137,18 @@ def foreign(kind, slices):
     }[kind]
     n = torch.from_numpy(np.random.default_rng(5).poisson(expected()) + 20.0)
     bad = torch.zeros(n.shape, dtype=torch.bool)
-    bad[20:50, 4, 15] = bad[60:72, 4, 40:43] = bad[7, 4, 30] = bad[80:82, 4, 25:27] = bad[30:34, 1, 50] = True
+    bad[20:50, 4, 15] = bad[60:72, 4, 40:43] = bad[7, 4, 30] = bad[80:82, 4, 25:27] = bad[
+        30:34, 1, 50
+    ] = True
     if not geometry.has_rows:
         n, bad = (v.movedim(1, 0) if slices else v[:, 4] for v in (n, bad))
     options = {"air": 4020.0, "dark": 20.0, "electronic_noise": 2.0}
     return [Scan.from_counts(v, geometry, **options) for v in (n, n.masked_fill(bad, 0.0))], bad
 
 
-@pytest.mark.parametrize(("kind", "slices"), [("parallel", False), ("parallel", True), ("fan", False), ("cone", False)])
+@pytest.mark.parametrize(
+    ("kind", "slices"), [("parallel", False), ("parallel", True), ("fan", False), ("cone", False)]
+)
 def test_cells_that_are_dead_for_part_of_the_turn_are_bridged_and_weigh_nothing(kind, slices):
     (sound, broken), bad = foreign(kind, slices)
     assert repair_defects(sound)[0] is sound
@@ -150,18 +166,29 @@ def test_cells_that_are_dead_for_part_of_the_turn_are_bridged_and_weigh_nothing(
 
 @pytest.mark.parametrize("blur", [0.3, 0.6])
 def test_shadows_of_opaque_pins_and_plates_are_no_defects(blur):
-    """One to eight cells wide, near the axis and far from it; a plate is opaque in a few views only."""
+    """One to eight cells wide, near the axis and far from it; a plate is opaque in a few views
+    only."""
     views, columns, sub = 180, 160, 8
-    beta, u = full_turn(views)[:, None], ((np.arange(columns * sub) + 0.5) / sub - columns / 2)[None]
+    beta, u = (
+        full_turn(views)[:, None],
+        ((np.arange(columns * sub) + 0.5) / sub - columns / 2)[None],
+    )
     lines = 0.03 * np.sqrt(np.clip(70.0**2 - u**2, 0, None)) + 0 * beta
     for distance, at, long, thick in (
-        (0.3, 0.0, 2.2, 2.2), (4.0, 1.0, 1.2, 1.2), (25.0, 2.0, 0.8, 0.8), (40.0, 3.0, 4.0, 4.0), (60.0, 4.0, 1.5, 1.5),
-        (30.0, 5.0, 12.0, 0.7), (5.0, 0.5, 9.0, 1.0),
-    ):  # fmt: skip
+        (0.3, 0.0, 2.2, 2.2),
+        (4.0, 1.0, 1.2, 1.2),
+        (25.0, 2.0, 0.8, 0.8),
+        (40.0, 3.0, 4.0, 4.0),
+        (60.0, 4.0, 1.5, 1.5),
+        (30.0, 5.0, 12.0, 0.7),
+        (5.0, 0.5, 9.0, 1.0),
+    ):
         half = np.hypot(long * np.cos(beta - at), thick * np.sin(beta - at))
         across = np.clip(1 - ((u - distance * np.sin(at - beta)) / half) ** 2, 0, None)
         lines = lines + 30.0 * 2 * long * thick / half * np.sqrt(across)
-    shone = gaussian_filter1d(np.exp(-lines), blur * sub, axis=1).reshape(views, columns, sub).mean(-1)
+    shone = (
+        gaussian_filter1d(np.exp(-lines), blur * sub, axis=1).reshape(views, columns, sub).mean(-1)
+    )
     n = np.random.default_rng(0).poisson(2e4 * shone).astype(np.float32)
     assert (n == 0).mean() > 0.05
     assert not find_defects(torch.from_numpy(n[:, None]), torch.full((1, columns), 2e4)).mask.any()
@@ -180,7 +207,8 @@ def test_cells_of_a_wrong_gain_side_by_side_are_found(counts):
 @pytest.mark.parametrize("radii", [(13.0, 62.0, 62.0), (9.0, 20.0, 20.0), (4.0, 48.0, 48.0)])
 @pytest.mark.parametrize("cell", [3.0, 8.0])
 def test_outlines_of_round_bodies_are_no_gains(radii, cell):
-    """An ellipsoid about the axis in coarse cells: its outline stays on its cells, in every row on others."""
+    """An ellipsoid about the axis in coarse cells: its outline stays on its cells, in every row
+    on others."""
     columns = round(180.0 / cell)
     g = ConeBeam(full_turn(40), 500.0, 800.0, columns, 9, (4.0, cell))
     body = Solid(BALL, (0.0, 0.0, 0.0), radii[::-1], 5.0 / (2.0 * radii[1]))
@@ -195,22 +223,27 @@ def test_outlines_of_round_bodies_are_no_gains(radii, cell):
     [
         (97, 15, 7.342, 3.671, -1.069, 35.21, 18.1, 4.49),  # alike on both sides of the axis
         (45, 15, 3.968, 1.984, 0.25, 23.87, 29.06, 4.7),
-        (48, 12, 2.231, 1.1155, 0.25, 27.66, 26.1, 2.84),  # a quarter column aside: above and below the plane
+        # a quarter column aside: above and below the plane
+        (48, 12, 2.231, 1.1155, 0.25, 27.66, 26.1, 2.84),
         (68, 6, 3.603, 0.0, 0.25, 45.94, 33.0, 5.3),
     ],
 )
 def test_outlines_on_both_sides_are_no_gains(columns, rows, pitch, up, aside, radius, height, most):
-    """2 to 4 cells of a wrong gain were found in each: one cell of the outline stands out of a row that is smooth."""
+    """2 to 4 cells of a wrong gain were found in each: one cell of the outline stands out of a
+    row that is smooth."""
     cell = 180.0 / columns
     g = ConeBeam(full_turn(24), 500.0, 800.0, columns, rows, (pitch, cell), (up, aside * cell))
-    shone = transmissions(g, [Solid(BALL, (0.0, 0.0, 0.0), (radius, radius, height), most / (2.0 * radius))])
+    shone = transmissions(
+        g, [Solid(BALL, (0.0, 0.0, 0.0), (radius, radius, height), most / (2.0 * radius))]
+    )
     for seed in range(2):
         n = np.random.default_rng(seed).poisson(4e4 * shone).astype(np.float32)
         assert find_defects(torch.from_numpy(n), torch.full(g.shape[1:], 4e4)).text == ""
 
 
 def test_a_detail_as_narrow_as_a_cell_is_no_lost_reading():
-    """A thin dense post along the rows' axis, dim in every row: a reading of it that is 0 is noise."""
+    """A thin dense post along the rows' axis, dim in every row: a reading of it that is 0 is
+    noise."""
     columns = (30 + 12 * np.sin(full_turn(VIEWS))).astype(int)
     n = np.array(expected())
     for view, column in enumerate(columns):

@@ -1,4 +1,5 @@
-"""Moments of the views: constant weight, frequency of the centre of mass; found where opposite rays cannot tell."""
+"""Moments of the views: constant weight, frequency of the centre of mass; found where opposite
+rays cannot tell."""
 
 import math
 from dataclasses import replace
@@ -38,7 +39,8 @@ def test_a_sound_scan_has_the_same_weight_from_all_sides(kind):
 
 @pytest.mark.parametrize("kind", GEOMETRIES)
 def test_readings_that_are_no_line_integrals_are_found(kind):
-    """Pile-up of 10 % was silent by every method: a counter of dead time reads n exp(-0.1 n / n in air)."""
+    """Pile-up of 10 % was silent by every method: a counter of dead time reads n exp(-0.1 n / n
+    in air)."""
     g = GEOMETRIES[kind]
     p = _lines(g)
     piled_up = p + 0.1 * (torch.exp(-p) - 1.0)
@@ -59,11 +61,17 @@ def test_the_range_of_a_half_turn_is_measured():
 
 
 def test_what_the_moments_cannot_show_raises_no_alarm():
-    """A round body weighs the same from all sides whatever the readings are; air, a few views, a part of a turn."""
+    """A round body weighs the same from all sides whatever the readings are; air, a few views, a
+    part of a turn."""
     g = GEOMETRIES["parallel"]
     t = g.column_positions / 80.0
     p = torch.from_numpy(3.0 * np.sqrt(np.maximum(1 - t**2, 0.0))).float().expand(g.shape)
     part = GEOMETRIES["half"].select(slice(60))
     few = g.select(slice(None, None, 20))
-    cases = ((p + 0.1 * (torch.exp(-p) - 1), g), (torch.zeros(g.shape), g), (_lines(part), part), (_lines(few), few))
+    cases = (
+        (p + 0.1 * (torch.exp(-p) - 1), g),
+        (torch.zeros(g.shape), g),
+        (_lines(part), part),
+        (_lines(few), few),
+    )
     assert all(moment_test(*case).findings == () for case in cases)

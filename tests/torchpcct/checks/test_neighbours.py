@@ -1,4 +1,5 @@
-"""Neighbouring views: wrong order, missing and stuck views, travel and flying spots are found; sound scans are not."""
+"""Neighbouring views: wrong order, missing and stuck views, travel and flying spots are found;
+sound scans are not."""
 
 import math
 import re
@@ -15,7 +16,8 @@ from torchpcct import ConeBeam, FanBeam, ParallelBeam, full_turn
 from torchpcct.checks.moments import moment_test
 from torchpcct.checks.neighbours import neighbour_test, stuck_views
 
-VIEWS, PHOTONS = 180, 2e5
+VIEWS = 180
+PHOTONS = 2e5
 BODIES = [
     Ellipsoid((0.0, 0.0), (55.0, 80.0), value=0.02),
     Ellipsoid((20.0, -30.0), 14.0, value=0.004),
@@ -36,7 +38,9 @@ def _sinogram(kind):
 
 
 def _counts(p, seed=0):
-    return torch.from_numpy(np.random.default_rng(seed).poisson(PHOTONS * np.exp(-p)).astype(np.float32))
+    return torch.from_numpy(
+        np.random.default_rng(seed).poisson(PHOTONS * np.exp(-p)).astype(np.float32)
+    )
 
 
 def _lines(p, seed=0):
@@ -51,7 +55,12 @@ def _found(p, g, seed=0):
 def test_sound_scans_raise_no_alarm_in_whatever_order_they_are_stored(kind):
     g, p = GEOMETRIES[kind], _sinogram(kind)
     order = np.random.default_rng(0).permutation(g.views)
-    assert _found(p, g) == _found(p[order], g.select(order)) == _found(p[::3], g.select(slice(None, None, 3))) == ()
+    assert (
+        _found(p, g)
+        == _found(p[order], g.select(order))
+        == _found(p[::3], g.select(slice(None, None, 3)))
+        == ()
+    )
     assert stuck_views(_counts(p), g) == []
     assert stuck_views(torch.from_numpy(p).float(), g) == []  # no noise
 
@@ -65,7 +74,10 @@ def test_views_in_random_or_text_order_are_named(kind):
         assert found
         assert "order" in found[0]
     coarse = slice(None, None, 2)
-    assert "not in the order" in _found(p[coarse][np.random.default_rng(1).permutation(90)], g.select(coarse))[0]
+    assert (
+        "not in the order"
+        in _found(p[coarse][np.random.default_rng(1).permutation(90)], g.select(coarse))[0]
+    )
 
 
 @pytest.mark.parametrize("kind", GEOMETRIES)
@@ -73,7 +85,9 @@ def test_angles_that_scatter_are_named_unless_they_are_described(kind):
     g = GEOMETRIES[kind]
     step = g.angles[1] - g.angles[0]
     for share in (0.3, 0.4):
-        true = replace(g, angles=g.angles + np.random.default_rng(1).normal(0.0, share * step, VIEWS))
+        true = replace(
+            g, angles=g.angles + np.random.default_rng(1).normal(0.0, share * step, VIEWS)
+        )
         p = line_integrals(true, BODIES, sub=1)
         (text,) = _found(p, g)
         assert re.search(r"scatter by about 0\.\d of a step", text)
@@ -87,13 +101,20 @@ def test_exchanged_and_lost_views_are_named(kind):
     g, p = GEOMETRIES[kind], _sinogram(kind)
     swapped = p.copy()
     swapped[[40, 120]] = p[[120, 40]]
-    assert any(f"views {k} and {k + 1}" in text for text in _found(swapped, g) for k in (39, 40, 119, 120))
+    assert any(
+        f"views {k} and {k + 1}" in text for text in _found(swapped, g) for k in (39, 40, 119, 120)
+    )
     turn = 2 * math.pi if kind != "half" else math.pi
     lost = replace(g, angles=np.linspace(0.0, turn, g.views - 5, endpoint=False))
     (text,) = _found(np.delete(p, range(70, 75), 0), lost)
     assert "the views 69 and 70 lie about" in text
     # The same views are no finding where the angles say what is missing.
-    assert _found(np.delete(p, range(70, 75), 0), g.select(np.delete(np.arange(g.views), range(70, 75)))) == ()
+    assert (
+        _found(
+            np.delete(p, range(70, 75), 0), g.select(np.delete(np.arange(g.views), range(70, 75)))
+        )
+        == ()
+    )
 
 
 @pytest.mark.parametrize("kind", GEOMETRIES)
@@ -120,7 +141,11 @@ def test_a_module_that_was_off_is_named_and_a_shadow_is_not(kind):
     off = _counts(p)
     off[60:90, ..., 70:78] = 0.0
     assert "the columns 70 … 77 read nothing in 30 views from number 60" in stuck_views(off, g)[0]
-    dense = [*BODIES, Ellipsoid((-30.0, -20.0), (2.0, 9.0), value=2.0), Ellipsoid((1.0, 2.0), 5.0, value=2.0)]
+    dense = [
+        *BODIES,
+        Ellipsoid((-30.0, -20.0), (2.0, 9.0), value=2.0),
+        Ellipsoid((1.0, 2.0), 5.0, value=2.0),
+    ]
     shadows = _counts(line_integrals(g, dense, sub=1))
     assert (shadows == 0).any()
     assert stuck_views(shadows, g) == []
@@ -163,18 +188,25 @@ THICK = ConeBeam(full_turn(90), 500.0, 900.0, 110, 12, (3.0, 3.6))
 def test_a_table_that_travels_or_wobbles_is_named():
     turns = np.arange(THICK.views) / THICK.views
     at_rest = _moving(THICK, lambda k: (0.0, 0.0, 0.0))
-    assert neighbour_test(_lines(at_rest), THICK).findings == moment_test(_lines(at_rest), THICK).findings == ()
+    assert (
+        neighbour_test(_lines(at_rest), THICK).findings
+        == moment_test(_lines(at_rest), THICK).findings
+        == ()
+    )
     helix = _lines(_moving(THICK, lambda k: (15.0 * turns[k], 0.0, 0.0)))
     found = (*neighbour_test(helix, THICK).findings, *moment_test(helix, THICK).findings)
     assert any("helix" in text for text in found)
-    wobble = moment_test(_lines(_moving(THICK, lambda k: (3.0 * math.sin(6 * math.pi * turns[k]), 0.0, 0.0))), THICK)
+    wobble = moment_test(
+        _lines(_moving(THICK, lambda k: (3.0 * math.sin(6 * math.pi * turns[k]), 0.0, 0.0))), THICK
+    )
     assert wobble.sizes["axial"] == pytest.approx(3.0 / math.sqrt(2.0), rel=0.5)
     assert "higher or lower" in wobble.findings[0]
 
 
 @pytest.mark.parametrize("cycles", [2.0, 3.0, 2.4])
 def test_an_object_that_breathes_is_named(cycles):
-    """Two cycles a turn bring the object back where the opposite ray comes: nothing but the moments shows them."""
+    """Two cycles a turn bring the object back where the opposite ray comes: nothing but the
+    moments shows them."""
     g = FanBeam(full_turn(120), 500.0, 900.0, 150, 2.6)
     swing = 4.0 * np.sin(2 * math.pi * cycles * np.arange(g.views) / g.views)
     parts = []

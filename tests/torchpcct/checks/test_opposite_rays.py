@@ -1,4 +1,5 @@
-"""Opposite rays: their test finds and measures a wrong centre, keeps its rate of false alarms, and knows its limits."""
+"""Opposite rays: their test finds and measures a wrong centre, keeps its rate of false alarms,
+and knows its limits."""
 
 import math
 from dataclasses import replace
@@ -23,7 +24,8 @@ from torchpcct.checks.opposite_rays import (
 from torchpcct.checks.ray_pairs import OppositeRays, RayPairs
 from torchpcct.detector_window import DetectorWindow
 
-VIEWS, RODS = 180, ((12.0, -7.0, 6.0, 0.02), (12.0, -7.0, 3.0, 0.01), (-20.0, 15.0, 9.0, 0.015))
+VIEWS = 180
+RODS = ((12.0, -7.0, 6.0, 0.02), (12.0, -7.0, 3.0, 0.01), (-20.0, 15.0, 9.0, 0.015))
 """Rods along z: x, y, radius in mm, attenuation in mm⁻¹."""
 WIDE = (*RODS, (25.0, -12.0, 6.0, 0.02), (-18.0, -20.0, 5.0, 0.02), (5.0, 28.0, 3.0, 0.03))
 GEOMETRIES = {
@@ -67,13 +69,19 @@ def test_an_error_within_the_tolerance_is_measured_but_no_finding():
 
 @pytest.mark.parametrize("kind", ["parallel", "fan"])
 def test_a_swing_is_found_and_a_displacement_is_not(kind):
-    """A rod that swings along y in quadrature with the views: no mean error of the centre, a wave of it."""
+    """A rod that swings along y in quadrature with the views: no mean error of the centre, a
+    wave of it."""
     g = GEOMETRIES[kind]
     x, y, radius, mu = RODS[0]
     swing = 0.8 * (g.pitch if kind == "parallel" else g.pitch / g.magnification)
 
     def scanned(shift):
-        return torch.cat([_lines(g.select(slice(k, k + 1)), [(x, y + d, radius, mu)]) for k, d in enumerate(shift)])
+        return torch.cat(
+            [
+                _lines(g.select(slice(k, k + 1)), [(x, y + d, radius, mu)])
+                for k, d in enumerate(shift)
+            ]
+        )
 
     moving = centre_test(scanned(swing * np.sin(g.angles)), g)
     assert abs(moving.sizes["centre"]) < CENTRE_TOLERANCE
@@ -138,7 +146,12 @@ def test_without_opposite_rays_or_anything_to_see_nothing_is_found():
     half = g.select(slice(60))
     above = replace(GEOMETRIES["cone"], offset=(40.0, 0.0))
     noise = torch.from_numpy(np.random.default_rng(0).standard_normal(g.shape).astype(np.float32))
-    cases = ((half, _lines(half)), (g, torch.zeros(g.shape)), (above, _lines(above)), (g, 1e-3 * noise))
+    cases = (
+        (half, _lines(half)),
+        (g, torch.zeros(g.shape)),
+        (above, _lines(above)),
+        (g, 1e-3 * noise),
+    )
     for geometry, lines in cases:
         found = centre_test(lines, geometry)
         assert found.findings == ()
@@ -170,10 +183,14 @@ def test_steps_between_views_of_a_wrong_size_are_found_and_measured(kind, part):
 @pytest.mark.parametrize("kind", ["parallel", "fan"])
 @pytest.mark.parametrize("order", ["from a quarter on", "backwards", "from 0 to 2π"])
 def test_steps_are_measured_wherever_the_turn_begins(kind, order):
-    """The opposite ray was read half a turn later or earlier, which the angle from 0 to 2π does not tell: sizes had the
-    other sign."""
+    """The opposite ray was read half a turn later or earlier, which the angle from 0 to 2π does not
+    tell: sizes had the other sign."""
     g = GEOMETRIES[kind]
-    begins = {"from a quarter on": 1.7 + g.angles, "backwards": 2.0 - g.angles, "from 0 to 2π": 4.0 + g.angles}[order]
+    begins = {
+        "from a quarter on": 1.7 + g.angles,
+        "backwards": 2.0 - g.angles,
+        "from 0 to 2π": 4.0 + g.angles,
+    }[order]
     g = replace(g, angles=begins)
     described = g.angles[0] + (g.angles - g.angles[0]) / 1.01
     wrong = replace(g, angles=described % (2 * math.pi) if order == "from 0 to 2π" else described)
@@ -184,7 +201,8 @@ def test_steps_are_measured_wherever_the_turn_begins(kind, order):
 
 @pytest.mark.parametrize("cause", ["centre", "scale", "step"])
 def test_large_errors_are_measured_to_what_is_said(cause):
-    """Of first order sizes were a third too small: they are measured again where nothing is left of them."""
+    """Of first order sizes were a third too small: they are measured again where nothing is left
+    of them."""
     g = GEOMETRIES["flat"]
     size = {"centre": 2.5, "scale": -0.07, "step": 0.025}[cause]
     wrong = {
@@ -206,7 +224,8 @@ def _box(photons):
 
 
 def test_what_few_views_see_is_found_and_measured():
-    """The scatter of the blocks' scores, in which few views have most of what is seen, hid errors of 30 sigmas."""
+    """The scatter of the blocks' scores, in which few views have most of what is seen, hid
+    errors of 30 sigmas."""
     g, lines = _box(3e4)
     assert geometry_test(lines, g).findings == ()
     for cause, size, wrong in (
@@ -219,15 +238,20 @@ def test_what_few_views_see_is_found_and_measured():
 
 
 def test_interpolation_is_no_error_of_the_description():
-    """Round bodies about the axis in coarse cells: their edges stay at one place between two cells in all views."""
+    """Round bodies about the axis in coarse cells: their edges stay at one place between two
+    cells in all views."""
     for radius in (6.3, 7.7, 9.1):
         g = FanBeam(full_turn(60), 60.0, 100.0, 26, 1.6, 0.5)
         lines = torch.from_numpy(
-            -np.log(transmissions(g, [Solid(CYLINDER, (0.0, 0.0, 0.0), (radius, radius, 1e5), 0.1)]))
+            -np.log(
+                transmissions(g, [Solid(CYLINDER, (0.0, 0.0, 0.0), (radius, radius, 1e5), 0.1)])
+            )
         )
         pairs = RayPairs.of(lines, g, None, (0.0, 0.0))
         known = pairs.known & torch.roll(pairs.known, 1, -1)
-        left, straight = (float(v[known].square().mean()) for v in (pairs.residue, pairs.difference))
+        left, straight = (
+            float(v[known].square().mean()) for v in (pairs.residue, pairs.difference)
+        )
         assert left < 0.7 * straight
         assert geometry_test(lines, g).findings == ()
 
@@ -267,29 +291,33 @@ def test_a_sound_scan_has_no_finding_and_small_sizes():
 
 
 def test_rays_that_have_nothing_in_common_are_named():
-    """Columns or angles of the other sign, views out of order, a half turn given as a whole one: all were silent."""
+    """Columns or angles of the other sign, views out of order, a half turn given as a whole one:
+    all were silent."""
     g = GEOMETRIES["fan"]
     lines = _lines(g, WIDE)
     half = g.select(slice(VIEWS // 2))
     wrong = (
-        (lines.flip(-1), g), (lines, replace(g, angles=-g.angles)),
+        (lines.flip(-1), g),
+        (lines, replace(g, angles=-g.angles)),
         (lines[np.random.default_rng(0).permutation(VIEWS)], g),
         (_lines(half, WIDE), replace(half, angles=full_turn(VIEWS // 2))),
-    )  # fmt: skip
+    )
     texts = [geometry_test(*case).findings[0] for case in wrong]
     assert ["counted the other way" in text for text in texts] == [True, True, False, False]
     assert ["little in common" in text for text in texts] == [False, False, True, True]
 
 
 def test_what_opposite_rays_cannot_show_raises_no_alarm():
-    """The angle of the first view; sod; parallel rays' pitch and direction: another object's scan, described right."""
+    """The angle of the first view; sod; parallel rays' pitch and direction: another object's
+    scan, described right."""
     g, parallel = GEOMETRIES["flat"], GEOMETRIES["parallel"]
     mirrored = replace(parallel, offset=-parallel.offset)
     for lines, other in (
-        (_lines(g, WIDE), replace(g, angles=g.angles + 0.3)), (_lines(g, WIDE), replace(g, sod=1.03 * g.sod)),
+        (_lines(g, WIDE), replace(g, angles=g.angles + 0.3)),
+        (_lines(g, WIDE), replace(g, sod=1.03 * g.sod)),
         (_lines(parallel, WIDE), replace(parallel, pitch=1.03, offset=0.2575)),
         (_lines(parallel, WIDE).flip(-1), mirrored),
-    ):  # fmt: skip
+    ):
         assert geometry_test(lines, other).findings == ()
 
 

@@ -1,4 +1,5 @@
-"""The plane of the orbit: what opposite rays part by along z is foretold, and rows that part are not averaged."""
+"""The plane of the orbit: what opposite rays part by along z is foretold, and rows that part are
+not averaged."""
 
 import math
 
@@ -25,14 +26,18 @@ def _cone(rows, up=0.0):
 def _scanned(g, bodies, photons=None):
     lines = line_integrals(g, bodies, sub=(6, 2))
     if photons:
-        lines = lines + np.random.default_rng(0).standard_normal(lines.shape) * np.exp(lines / 2) / math.sqrt(photons)
+        lines = lines + np.random.default_rng(0).standard_normal(lines.shape) * np.exp(
+            lines / 2
+        ) / math.sqrt(photons)
     return torch.from_numpy(lines.astype(np.float32))
 
 
 def _difference(g, plane):
     """Mean square of what opposite rays differ by."""
     fan = g.central_fan
-    opposite, known = OppositeRays(fan, DetectorWindow.full(fan), (0.0, 0.0)).opposite(plane.lines, np.arange(g.views))
+    opposite, known = OppositeRays(fan, DetectorWindow.full(fan), (0.0, 0.0)).opposite(
+        plane.lines, np.arange(g.views)
+    )
     return float((plane.lines - opposite)[known].double().square().mean())
 
 
@@ -50,7 +55,9 @@ def test_what_rays_part_by_is_foretold(up, thick):
 
 def test_a_tall_object_uses_all_rows_that_hardly_part():
     g = _cone(9)
-    plane = orbit_plane(_scanned(g, [Ellipsoid((30.0, -20.0), (40.0, 25.0), value=0.02)], photons=1e4), g)
+    plane = orbit_plane(
+        _scanned(g, [Ellipsoid((30.0, -20.0), (40.0, 25.0), value=0.02)], photons=1e4), g
+    )
     assert plane.rows >= 5  # the outermost ones are the borders
     assert plane.part < 0.05
     assert math.sqrt(plane.parted) < 0.002
@@ -65,7 +72,9 @@ def test_a_face_beside_the_plane_leaves_the_rows_within():
 def test_of_one_or_two_rows_nobody_knows_where_the_object_ends():
     for rows in (1, 2):
         g = _cone(rows)
-        plane = orbit_plane(_scanned(g, [Ellipsoid((0.0, 30.0, -20.0), (0.8, 40.0, 25.0), value=0.02)]), g)
+        plane = orbit_plane(
+            _scanned(g, [Ellipsoid((0.0, 30.0, -20.0), (0.8, 40.0, 25.0), value=0.02)]), g
+        )
         assert plane.part > 0.99
         assert _difference(g, plane) < plane.parted
 
@@ -85,7 +94,8 @@ THIN = {
 @pytest.mark.parametrize("body", THIN)
 @pytest.mark.parametrize("rows", [2, 7])
 def test_thin_bodies_within_the_rows_are_told_nothing(body, rows):
-    """Fan angles 12 … 22 % too small, a sum that changes with the direction: the face of a disc in the rows."""
+    """Fan angles 12 … 22 % too small, a sum that changes with the direction: the face of a disc
+    in the rows."""
     g = _cone(rows)
     n = np.random.default_rng(1).poisson(1e5 * transmissions(g, [THIN[body]], subs=(3, 12, 1)))
     lines = torch.from_numpy(np.log(1e5 / (n + 0.5)).astype(np.float32))

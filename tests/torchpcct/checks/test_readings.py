@@ -1,4 +1,5 @@
-"""Readings: wrong descriptions come out right, or are named, sound scans are not; dead ones are bridged exactly."""
+"""Readings: wrong descriptions come out right, or are named, sound scans are not; dead ones are
+bridged exactly."""
 
 import math
 import re
@@ -14,7 +15,8 @@ from torchpcct.checks.defects import repair_defects
 from torchpcct.checks.readings import reading_warnings
 from torchpcct.readings import bridge, log_bias, smoothed
 
-MU, AIR = 0.02, 1e5
+MU = 0.02
+AIR = 1e5
 BODY = [
     Ellipsoid((2.0, -3.0), (80.0, 100.0), value=MU),
     Ellipsoid((30.0, 20.0), (12.0, 12.0), value=MU),
@@ -38,7 +40,9 @@ def water(volume):
 
 
 def warnings_of(readings, **description):
-    return reading_warnings(repair_defects(Scan.from_counts(readings, FAN, mu_water=MU, **description))[0])
+    return reading_warnings(
+        repair_defects(Scan.from_counts(readings, FAN, mu_water=MU, **description))[0]
+    )
 
 
 def test_transmissions_are_no_counts():
@@ -50,7 +54,10 @@ def test_transmissions_are_no_counts():
         assert float(scan.air.mean()) == pytest.approx(AIR, rel=0.15)  # the photons, from the noise
         assert reading_warnings(scan) == []
         torch.testing.assert_close(
-            scan.weights(), Scan.from_counts(n, FAN, air=AIR, mu_water=MU).weights(), rtol=0.15, atol=0
+            scan.weights(),
+            Scan.from_counts(n, FAN, air=AIR, mu_water=MU).weights(),
+            rtol=0.15,
+            atol=0,
         )
     low = counted(air=60.0)  # counts stay what they are
     assert torch.equal(Scan.from_counts(low, FAN, air=60.0).counts, torch.from_numpy(low).float())
@@ -61,7 +68,8 @@ def test_the_logarithm_of_few_counts_is_not_biased():
     for mean in (0.5, 1.0, 2.0, 5.0, 30.0):
         n = torch.from_numpy(rng.poisson(mean, (60, 2000)).astype(np.float32))
         lines = torch.log(n + 0.5) - log_bias(smoothed(n, None, False))
-        assert float(lines.mean()) == pytest.approx(np.log(mean), abs=0.04)  # 0.48 at half a count, 0.17 at one
+        # 0.48 at half a count, 0.17 at one
+        assert float(lines.mean()) == pytest.approx(np.log(mean), abs=0.04)
     few = 0.2 * AIR**0.5 / SHONE.mean() / 4
     scan = Scan.from_counts(counted(air=few), FAN, air=few, mu_water=MU)
     assert 8 < float(scan.counts.mean()) < 20
@@ -69,16 +77,36 @@ def test_the_logarithm_of_few_counts_is_not_biased():
 
 
 WRONG = {
-    "an offset below both": (lambda: counted() + 2000.0, {"air": AIR + 2000.0}, "over an offset of"),
+    "an offset below both": (
+        lambda: counted() + 2000.0,
+        {"air": AIR + 2000.0},
+        "over an offset of",
+    ),
     "an offset below the readings": (lambda: counted() + 2000.0, {"air": AIR}, "over an offset of"),
-    "scatter": (lambda: counted(SHONE + 0.05), {"air": AIR}, r"beside the object are 4\.[89] % brighter"),
-    "full well": (lambda: np.minimum(counted(), 0.5 * AIR), {"air": AIR}, "the detector is saturated"),
-    "full well in air, too": (lambda: np.minimum(counted(), 0.5 * AIR), {"air": 0.5 * AIR}, "detector is saturated"),
+    "scatter": (
+        lambda: counted(SHONE + 0.05),
+        {"air": AIR},
+        r"beside the object are 4\.[89] % brighter",
+    ),
+    "full well": (
+        lambda: np.minimum(counted(), 0.5 * AIR),
+        {"air": AIR},
+        "the detector is saturated",
+    ),
+    "full well in air, too": (
+        lambda: np.minimum(counted(), 0.5 * AIR),
+        {"air": 0.5 * AIR},
+        "detector is saturated",
+    ),
     "line integrals": (lambda: LINES.clip(0), {"air": 1.0}, "line integrals given as counts"),
-    "line integrals, scaled": (lambda: 1000 * LINES.clip(0), {"air": 1e4}, "darkest .* given as counts"),
+    "line integrals, scaled": (
+        lambda: 1000 * LINES.clip(0),
+        {"air": 1e4},
+        "darkest .* given as counts",
+    ),
     "another beam's air": (counted, {"air": 0.5 * AIR}, "more than 1.5 times as bright as air"),
     "no light": (lambda: counted(air=6.0), {"air": 6.0}, r"leave less than 0\.3 photons"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("what", WRONG)
@@ -99,7 +127,9 @@ def test_transmissions_given_as_line_integrals_are_named_by_every_method(caplog)
 
 
 @pytest.mark.parametrize("air", [30.0, 1e3, 1e5])
-@pytest.mark.parametrize("kind", ["parallel", "fan", "cone", "cut off", "metal", "bowtie", "blurred", "lines"])
+@pytest.mark.parametrize(
+    "kind", ["parallel", "fan", "cone", "cut off", "metal", "bowtie", "blurred", "lines"]
+)
 def test_sound_scans_are_not_accused(kind, air):
     rng, profile, bodies = np.random.default_rng(3), np.ones(96), list(BODY)
     g = {
@@ -108,7 +138,10 @@ def test_sound_scans_are_not_accused(kind, air):
         "cut off": FanBeam(full_turn(120), 600.0, 1100.0, 96, 2.5),
     }.get(kind, FanBeam(full_turn(120), 600.0, 1100.0, 96, 4.6))
     if kind == "metal":
-        bodies += [Ellipsoid((-30.0, 30.0), (6.0, 9.0), value=2.0), Ellipsoid((40.0, -20.0), (2.5, 2.5), value=5.0)]
+        bodies += [
+            Ellipsoid((-30.0, 30.0), (6.0, 9.0), value=2.0),
+            Ellipsoid((40.0, -20.0), (2.5, 2.5), value=5.0),
+        ]
     if kind == "bowtie":
         profile = np.exp(-2.0 * np.linspace(-1, 1, 96) ** 2) * rng.uniform(0.9, 1.1, 96)
     n = rng.poisson(air * profile * np.exp(-0.7 * line_integrals(g, bodies, sub=1))).astype(float)
@@ -123,14 +156,18 @@ def test_sound_scans_are_not_accused(kind, air):
 
 
 def test_bridging_is_linear_and_knows_nothing_of_the_dead():
-    ramp = 2.0 * torch.arange(9.0) + torch.arange(4.0)[:, None] * 5 + torch.arange(3.0)[:, None, None]
+    ramp = (
+        2.0 * torch.arange(9.0) + torch.arange(4.0)[:, None] * 5 + torch.arange(3.0)[:, None, None]
+    )
     dead = torch.zeros(3, 4, 9, dtype=torch.bool)
     dead[1, :, 4:6] = True
     dead[2, 1] = True  # a whole row
     broken = torch.where(dead, math.nan, ramp)
     torch.testing.assert_close(bridge(broken, dead, rows=True), ramp)
     edge = torch.where(torch.arange(9) < 2, math.inf, ramp[0])
-    torch.testing.assert_close(bridge(edge, torch.arange(9) < 2, rows=True)[:, :2], ramp[0, :, 2:3].expand(-1, 2))
+    torch.testing.assert_close(
+        bridge(edge, torch.arange(9) < 2, rows=True)[:, :2], ramp[0, :, 2:3].expand(-1, 2)
+    )
     x = broken.double().requires_grad_()
     (gradient,) = torch.autograd.grad(bridge(x, dead, rows=True).sum(), x)
     assert gradient[dead].abs().max() == 0
@@ -140,7 +177,12 @@ def test_bridging_is_linear_and_knows_nothing_of_the_dead():
 
 
 def test_lost_columns_rows_and_views_of_linear_data_come_back():
-    lines = 1 + 0.1 * torch.arange(9.0)[:, None, None] - 0.2 * torch.arange(5.0)[:, None] + 0.05 * torch.arange(11.0)
+    lines = (
+        1
+        + 0.1 * torch.arange(9.0)[:, None, None]
+        - 0.2 * torch.arange(5.0)[:, None]
+        + 0.05 * torch.arange(11.0)
+    )
     mask = torch.zeros(lines.shape, dtype=torch.bool)
     mask[:, :, 4:6] = mask[3] = mask[:, 2] = True
     broken = torch.where(mask, 1e9, lines)
@@ -148,7 +190,12 @@ def test_lost_columns_rows_and_views_of_linear_data_come_back():
 
 
 def test_at_the_edge_the_other_axis_serves_and_then_the_nearest():
-    lines = 1 + 0.1 * torch.arange(9.0)[:, None, None] - 0.2 * torch.arange(5.0)[:, None] + 0.05 * torch.arange(11.0)
+    lines = (
+        1
+        + 0.1 * torch.arange(9.0)[:, None, None]
+        - 0.2 * torch.arange(5.0)[:, None]
+        + 0.05 * torch.arange(11.0)
+    )
     mask = torch.zeros(lines.shape, dtype=torch.bool)
     mask[:, 2, 0] = True  # the rows beside it are alive
     torch.testing.assert_close(bridge(lines.masked_fill(mask, 1e9), mask, rows=True), lines)

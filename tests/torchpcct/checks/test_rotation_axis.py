@@ -1,4 +1,5 @@
-"""The rotation axis is found within its stated error, whatever the beam, the turn, the noise and the cells' gains."""
+"""The rotation axis is found within its stated error, whatever the beam, the turn, the noise and
+the cells' gains."""
 
 import math
 from dataclasses import replace
@@ -31,15 +32,26 @@ def beam(kind, angles):
 
 
 def scanned(g, radius, column, photons, cells, seed):
-    """Line integrals of an ellipse with 20 others in it, noise, and gains of single cells that are off."""
+    """Line integrals of an ellipse with 20 others in it, noise, and gains of single cells that
+    are off."""
     rng = np.random.default_rng(seed)
-    bodies = [Ellipsoid((0.05 * radius, -0.03 * radius), (0.7 * radius, 0.85 * radius), value=1 / radius)]
+    bodies = [
+        Ellipsoid((0.05 * radius, -0.03 * radius), (0.7 * radius, 0.85 * radius), value=1 / radius)
+    ]
     for _ in range(20):
-        r, t, s = 0.6 * math.sqrt(rng.uniform()), rng.uniform(0, 2 * math.pi), rng.uniform(0.01, 0.12)
+        r, t, s = (
+            0.6 * math.sqrt(rng.uniform()),
+            rng.uniform(0, 2 * math.pi),
+            rng.uniform(0.01, 0.12),
+        )
         place = (radius * r * math.sin(t), radius * r * math.cos(t))
-        bodies.append(Ellipsoid(place, (radius * s, radius * s), value=rng.uniform(-0.6, 1.5) / radius))
+        bodies.append(
+            Ellipsoid(place, (radius * s, radius * s), value=rng.uniform(-0.6, 1.5) / radius)
+        )
     p = line_integrals(at_axis(g, column), bodies, sub=3)
-    p += rng.standard_normal(p.shape) * np.exp(p / 2) / math.sqrt(photons) + cells * rng.standard_normal(p.shape[1:])
+    p += rng.standard_normal(p.shape) * np.exp(p / 2) / math.sqrt(
+        photons
+    ) + cells * rng.standard_normal(p.shape[1:])
     return torch.from_numpy(p.astype(np.float32))
 
 
@@ -48,7 +60,12 @@ def scanned(g, radius, column, photons, cells, seed):
     [("parallel", turn) for turn in TURNS] + [("flat", "full"), ("curved", "short")],
 )
 def test_the_axis_lies_within_its_error(kind, turn):
-    cases = ((59.9, 1e5, 0.0, 1.0), (52.2, 1e4, 0.004, 1.0), (71.7, 1e3, 0.0, 0.8), (57.25, 1e4, 0.003, 1.3))
+    cases = (
+        (59.9, 1e5, 0.0, 1.0),
+        (52.2, 1e4, 0.004, 1.0),
+        (71.7, 1e3, 0.0, 0.8),
+        (57.25, 1e4, 0.003, 1.3),
+    )
     for seed, (column, photons, cells, size) in enumerate(cases):
         g, radius = beam(kind, TURNS[turn](60 if seed % 2 else 151))
         found = rotation_axis(scanned(g, size * radius, column, photons, cells, seed), g)
@@ -89,10 +106,12 @@ def test_noise_tells_no_axis(kind, turn):
 
 @pytest.mark.parametrize("kind", ["parallel", "flat"])
 def test_an_object_that_is_round_about_the_axis(kind):
-    """Taking off what all views share leaves noise: 66 ± 4 for 75.3. Parallel rays' half turn tells the axis all the
-    same, other rays nothing."""
+    """Taking off what all views share leaves noise: 66 ± 4 for 75.3. Parallel rays' half turn tells
+    the axis all the same, other rays nothing."""
     g, radius = beam(kind, full_turn(90))
-    lines = line_integrals(at_axis(g, 63.2), [Ellipsoid((0.0, 0.0), radius, value=1 / radius)], sub=3)
+    lines = line_integrals(
+        at_axis(g, 63.2), [Ellipsoid((0.0, 0.0), radius, value=1 / radius)], sub=3
+    )
     for seed in range(4):
         noise = np.random.default_rng(seed).standard_normal(lines.shape) * np.exp(lines / 2) / 1e3
         noisy = torch.from_numpy((lines + noise).astype(np.float32))
@@ -104,7 +123,9 @@ def test_an_object_that_is_round_about_the_axis(kind):
                 rotation_axis(noisy, g)
 
 
-@pytest.mark.parametrize("order", ["clockwise", "clockwise inclusive", "shuffled", "from the middle"])
+@pytest.mark.parametrize(
+    "order", ["clockwise", "clockwise inclusive", "shuffled", "from the middle"]
+)
 def test_half_turns_in_any_order(order):
     """They were refused: the angles were counted from that of the first view."""
     angles = {
@@ -119,13 +140,16 @@ def test_half_turns_in_any_order(order):
 
 
 def test_the_error_covers_what_rays_part_by_along_z():
-    """A plate whose face lies in the rows about the plane: opposite rays of a cone differ there, and pull the axis."""
+    """A plate whose face lies in the rows about the plane: opposite rays of a cone differ there,
+    and pull the axis."""
     rng = np.random.default_rng(0)
     for seed in range(6):
         g, radius = beam("cone", full_turn(60))
         g = replace(g, rows=5, pitch=(2.0, 1.0))
         place = (rng.uniform(-1, 1), *rng.uniform(-0.4, 0.4, 2) * radius)
-        body = [Ellipsoid(place, (rng.uniform(0.5, 3.0), 0.4 * radius, 0.55 * radius), value=1 / radius)]
+        body = [
+            Ellipsoid(place, (rng.uniform(0.5, 3.0), 0.4 * radius, 0.55 * radius), value=1 / radius)
+        ]
         lines = line_integrals(at_axis(g, 60.2), body, sub=(6, 2))
         noise = 0.003 * np.random.default_rng(seed).standard_normal(lines.shape)
         found = rotation_axis(torch.from_numpy((lines + noise).astype(np.float32)), g)
@@ -141,10 +165,18 @@ def test_the_axis_as_text():
 def test_of_several_slices_the_richest_is_looked_at_and_a_scan_is_centred():
     g, radius = beam("parallel", full_turn(90))
     lines = scanned(g, radius, 61.3, 1e4, 0.0, 3)
-    empty = 0.01 * torch.from_numpy(np.random.default_rng(1).standard_normal(lines.shape).astype(np.float32))
-    scan = Scan.from_line_integrals(torch.stack([empty, lines, empty]), replace(g, offset=5.0), photons=1e4)
+    empty = 0.01 * torch.from_numpy(
+        np.random.default_rng(1).standard_normal(lines.shape).astype(np.float32)
+    )
+    scan = Scan.from_line_integrals(
+        torch.stack([empty, lines, empty]), replace(g, offset=5.0), photons=1e4
+    )
     found = find_axis(scan)
     assert found.column == pytest.approx(61.3, abs=found.error)
     made = centred(scan)
     assert axis_column(made.geometry) == pytest.approx(found.column)
-    assert made.info["axis"] == {"column": found.column, "error": found.error, "found_from": "opposite rays"}
+    assert made.info["axis"] == {
+        "column": found.column,
+        "error": found.error,
+        "found_from": "opposite rays",
+    }

@@ -1,4 +1,5 @@
-"""Absorbed dose: closed forms, conservation of energy, invariances, and Monte Carlo against the exact primary map."""
+"""Absorbed dose: closed forms, conservation of energy, invariances, and Monte Carlo against the
+exact primary map."""
 
 import math
 
@@ -8,7 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import refused
 
-from torchpcct.dose import air_fluence, ctdi_dose, mass_energy_absorption, monte_carlo_dose, primary_dose
+from torchpcct.dose import (
+    air_fluence,
+    ctdi_dose,
+    mass_energy_absorption,
+    monte_carlo_dose,
+    primary_dose,
+)
 from torchpcct.dose.coefficients import MGY_PER_KEV_PER_G, fan_half_angle
 from torchpcct.dose.ctdi import CtdiDose, disc_samples
 from torchpcct.dose.scatter import _form_factor
@@ -29,7 +36,8 @@ NIST = {
 
 
 def mono(energy=60.0, bowtie="none", **options):
-    """A scanner whose tube sends 1000 photons / mm² / mAs at 1 m, of one energy, without filters."""
+    """A scanner whose tube sends 1000 photons / mm² / mAs at 1 m, of one energy, without
+    filters."""
     scanner = presets.pcct(rows=1, columns=2200, bowtie=bowtie, **options)
     return scanner.replace(source=Source.tabulated([energy], [1000.0]), filters=())
 
@@ -48,7 +56,9 @@ def test_energy_absorption_agrees_with_nist(name):
 def test_dose_at_the_centre_of_a_cylinder_has_a_closed_form():
     scanner, water = mono(), material("water")
     scene = water_cylinder(200.0)
-    fluence = 1000.0 * (1000.0 / 626.0) ** 2 * 350.0 * math.exp(-float(water.attenuation(60.0)) * 100.0)
+    fluence = (
+        1000.0 * (1000.0 / 626.0) ** 2 * 350.0 * math.exp(-float(water.attenuation(60.0)) * 100.0)
+    )
     expected = fluence * 60.0 * mass_energy_absorption(water, 60.0)[0] * MGY_PER_KEV_PER_G
     for axial in ("plane", "contiguous"):
         dose = primary_dose(scene, scanner, np.zeros((1, 2)), 0.35, axial=axial)
@@ -70,11 +80,14 @@ def test_inverse_square_in_air(radius, phi):
 
 
 def test_interacting_energy_is_what_the_beam_loses():
-    """One view, dose × density summed over the plane = energy in − energy out, per mm of beam at the isocentre."""
+    """One view, dose × density summed over the plane = energy in − energy out, per mm of beam at
+    the isocentre."""
     scanner, scene = mono(50.0), water_cylinder(180.0)
     spacing = 0.5
     grid = VolumeGrid((380, 380), spacing)
-    dose = primary_dose(scene, scanner, grid, 1.0, quantity="interacted", axial="contiguous", views=1)
+    dose = primary_dose(
+        scene, scanner, grid, 1.0, quantity="interacted", axial="contiguous", views=1
+    )
     absorbed = dose.sum() * spacing**2 * 1e-3 / MGY_PER_KEV_PER_G
     gamma = (np.arange(20001) / 20000.0 * 2.0 - 1.0) * math.asin(90.0 / 626.0)
     chord = 2.0 * np.sqrt(np.maximum(90.0**2 - (626.0 * np.sin(gamma)) ** 2, 0.0))
@@ -87,13 +100,17 @@ def test_dose_is_linear_in_exposure_and_follows_a_turn(scanners):
     scene = Scene(
         [
             Body("body", EllipticCylinder((150.0, 100.0)), "water"),
-            Body("bone", EllipticCylinder(15.0, position=(60.0, 30.0, 0.0)), "cortical_bone", "body"),
+            Body(
+                "bone", EllipticCylinder(15.0, position=(60.0, 30.0, 0.0)), "cortical_bone", "body"
+            ),
         ]
     )
     turned = Scene(
         [
             Body("body", EllipticCylinder((100.0, 150.0)), "water"),
-            Body("bone", EllipticCylinder(15.0, position=(-30.0, 60.0, 0.0)), "cortical_bone", "body"),
+            Body(
+                "bone", EllipticCylinder(15.0, position=(-30.0, 60.0, 0.0)), "cortical_bone", "body"
+            ),
         ]
     )
     points = np.array([[80.0, 20.0], [-100.0, 5.0], [60.0, 30.0]])
@@ -110,12 +127,17 @@ def test_map_and_points_agree_and_air_gets_none(scanners):
     y, x = np.meshgrid(*grid.axes, indexing="ij")
     np.testing.assert_array_equal(dose > 0, np.hypot(x, y) <= 50.0)
     points = np.stack([x, y], axis=-1)
-    np.testing.assert_array_equal(primary_dose(scene, scanners["large"], points, 0.35, views=60), dose)
+    np.testing.assert_array_equal(
+        primary_dose(scene, scanners["large"], points, 0.35, views=60), dose
+    )
 
 
 def test_the_slice_is_the_one_asked_for(scanners):
     scene = Scene([Body("ball", Ellipsoid(50.0, position=(0.0, 0.0, 20.0)), "water")])
-    at = [primary_dose(scene, scanners["large"], np.zeros((1, 2)), 0.35, z_mm=z)[0] for z in (20.0, 60.0, 71.0)]
+    at = [
+        primary_dose(scene, scanners["large"], np.zeros((1, 2)), 0.35, z_mm=z)[0]
+        for z in (20.0, 60.0, 71.0)
+    ]
     radius = np.array([50.0, 30.0])
     energies, photons = air_fluence(scanners["large"], [0.0])
     water = material("water")
@@ -130,7 +152,10 @@ def test_energy_groups_and_views_are_fine_enough(scanners):
     dose = primary_dose(scene, scanners["large"], points, 0.35).mean()
     fine = primary_dose(scene, scanners["large"], points, 0.35, group_kev=0.0, views=1440).mean()
     assert dose == pytest.approx(fine, rel=5e-3)
-    centre = [primary_dose(scene, scanners["large"], np.zeros((1, 2)), 0.35, group_kev=k)[0] for k in (3.0, 0.0)]
+    centre = [
+        primary_dose(scene, scanners["large"], np.zeros((1, 2)), 0.35, group_kev=k)[0]
+        for k in (3.0, 0.0)
+    ]
     assert centre[0] == pytest.approx(centre[1], rel=5e-3)
 
 
@@ -165,10 +190,13 @@ def test_narrow_fans_shade_the_outside(scanners):
     narrow = presets.pcct(rows=1, columns=400)
     point = np.array([[150.0, 0.0]])
     scene = ctdi()
-    assert primary_dose(scene, narrow, point, 0.35)[0] < 0.8 * primary_dose(scene, scanners["large"], point, 0.35)[0]
+    assert (
+        primary_dose(scene, narrow, point, 0.35)[0]
+        < 0.8 * primary_dose(scene, scanners["large"], point, 0.35)[0]
+    )
 
 
-# -- Monte Carlo ------------------------------------------------------------------------------------------------------
+# -- Monte Carlo -----------------------------------------------------------------------------------
 
 
 @pytest.mark.extended
@@ -182,20 +210,28 @@ def test_monte_carlo_primary_is_the_exact_primary(scanners):
         for low, high in ((0, 40), (40, 80), (80, 98)):
             ring = (radius >= low) & (radius < high)
             spread = result.batches[:, 0, ring].mean(-1).std(ddof=1) / 4.0
-            assert abs(result.primary[ring].mean() - exact[ring].mean()) < 4.0 * spread + 5e-3 * exact[ring].mean()
+            assert (
+                abs(result.primary[ring].mean() - exact[ring].mean())
+                < 4.0 * spread + 5e-3 * exact[ring].mean()
+            )
 
 
 def test_monte_carlo_conserves_energy():
-    """Bone stops soft photons and sends little back: what entered is absorbed, all but the backscatter."""
+    """Bone stops soft photons and sends little back: what entered is absorbed, all but the
+    backscatter."""
     scanner, bone = mono(30.0), material("cortical_bone")
     scene, grid = water_cylinder(300.0, material="cortical_bone"), VolumeGrid((310, 310), 1.0)
     result = monte_carlo_dose(
         scene, scanner, grid, 1.0, histories=60_000, scan_length_mm=400.0, phantom_length_mm=400.0
     )
-    absorbed = (result.primary + result.scattered).sum() * bone.density_g_cm3 * 1e-3 / MGY_PER_KEV_PER_G
+    absorbed = (
+        (result.primary + result.scattered).sum() * bone.density_g_cm3 * 1e-3 / MGY_PER_KEV_PER_G
+    )
     incident = 1000.0 * 1e6 / 626.0 * 2.0 * math.asin(150.0 / 626.0) * 30.0 * 1000.0
     assert 0.94 * incident < absorbed < incident
-    thin = monte_carlo_dose(water_cylinder(20.0), mono(), VolumeGrid((14, 14), 2.0), 1.0, histories=60_000)
+    thin = monte_carlo_dose(
+        water_cylinder(20.0), mono(), VolumeGrid((14, 14), 2.0), 1.0, histories=60_000
+    )
     assert thin.scattered.sum() < 0.4 * thin.primary.sum()
 
 
@@ -206,10 +242,14 @@ def test_compton_samples_follow_klein_and_nishina(energy):
         state, scattered, cosine = _compton(energy, np.uint64(state))
         photons.append((scattered, cosine))
     scattered, cosine = np.array(photons).T
-    np.testing.assert_allclose(scattered, energy / (1.0 + energy / 510.99895 * (1.0 - cosine)), rtol=1e-12)
+    np.testing.assert_allclose(
+        scattered, energy / (1.0 + energy / 510.99895 * (1.0 - cosine)), rtol=1e-12
+    )
     electron, probability = recoil([energy])
     mean, square = ((probability * electron**k).sum() for k in (1, 2))
-    assert (energy - scattered).mean() == pytest.approx(mean, abs=4.0 * math.sqrt((square - mean**2) / 20_000))
+    assert (energy - scattered).mean() == pytest.approx(
+        mean, abs=4.0 * math.sqrt((square - mean**2) / 20_000)
+    )
     assert ((energy - scattered) ** 2).mean() == pytest.approx(square, rel=0.03)
 
 
@@ -226,7 +266,9 @@ def test_scattered_directions_keep_the_angle(dz, azimuth, cosine, phi):
 def test_a_longer_scan_adds_scatter_only(scanners):
     grid, scene = VolumeGrid((60, 60), 4.0), water_cylinder(200.0)
     short, long = (
-        monte_carlo_dose(scene, scanners["large"], grid, 0.35, histories=16_000, scan_length_mm=length)
+        monte_carlo_dose(
+            scene, scanners["large"], grid, 0.35, histories=16_000, scan_length_mm=length
+        )
         for length in (5.0, 100.0)
     )
     np.testing.assert_array_equal(short.primary, long.primary)
@@ -244,11 +286,14 @@ def test_rayleigh_samples_follow_the_form_factor(energy):
     x2 = (energy / 12.398419843) ** 2 * (1.0 - c) / 2.0
     density = np.gradient(np.interp(x2, squares, cumulative), x2) * (1.0 + c * c)
     mean, square = ((density * c**k).sum() / density.sum() for k in (1, 2))
-    assert np.mean(cosines) == pytest.approx(mean, abs=5.0 * math.sqrt((square - mean**2) / 20_000) + 1e-3)
+    assert np.mean(cosines) == pytest.approx(
+        mean, abs=5.0 * math.sqrt((square - mean**2) / 20_000) + 1e-3
+    )
 
 
 def test_scatter_brings_the_centre_up(scanners):
-    """A measured 32 cm phantom reads about twice at the periphery of what it reads at the centre, not ten times."""
+    """A measured 32 cm phantom reads about twice at the periphery of what it reads at the
+    centre, not ten times."""
     dose = ctdi_dose(scanners["large"], 0.35, histories=160_000)
     assert 1.6 < dose.total_peripheral / dose.total_central < 2.8
     assert dose.peripheral / dose.central > 8.0
@@ -257,7 +302,10 @@ def test_scatter_brings_the_centre_up(scanners):
 
 def test_monte_carlo_repeats_and_differs_by_seed(scanners):
     grid, scene = VolumeGrid((60, 60), 4.0), water_cylinder(200.0)
-    run = [monte_carlo_dose(scene, scanners["large"], grid, 0.35, histories=3200, seed=s).scattered for s in (1, 1, 2)]
+    run = [
+        monte_carlo_dose(scene, scanners["large"], grid, 0.35, histories=3200, seed=s).scattered
+        for s in (1, 1, 2)
+    ]
     np.testing.assert_array_equal(run[0], run[1])
     assert not np.array_equal(run[0], run[2])
 
@@ -270,7 +318,12 @@ def test_form_factor_is_that_of_the_electrons():
 
 
 def test_bad_input_is_refused(scanners):
-    scanner, scene, grid, point = scanners["large"], water_cylinder(), VolumeGrid((110, 110), 2.0), np.zeros((1, 2))
+    scanner, scene, grid, point = (
+        scanners["large"],
+        water_cylinder(),
+        VolumeGrid((110, 110), 2.0),
+        np.zeros((1, 2)),
+    )
     moving = scene.with_motion(SinusoidalMotion("cylinder", 1.0))
     simulated = monte_carlo_dose(scene, scanner, grid, 0.35, histories=160)
 

@@ -14,10 +14,17 @@ GEOMETRY = ParallelBeam(np.arange(60) * np.pi / 60, 32, 0.5)
 
 
 def frames(seed=0):
-    """Projections, flats and darks of three rows of a disc, photons of two units each above a dark of 100."""
+    """Projections, flats and darks of three rows of a disc, photons of two units each above a
+    dark of 100."""
     rng = np.random.default_rng(seed)
-    lines = 0.08 * np.sqrt(np.clip(6.0**2 - GEOMETRY.column_positions**2, 0, None)) * np.ones((60, 3, 1))
-    data, white = (2 * rng.poisson(n) + 100 for n in (1e4 * np.exp(-lines), np.full((6, 3, 32), 1e4)))
+    lines = (
+        0.08
+        * np.sqrt(np.clip(6.0**2 - GEOMETRY.column_positions**2, 0, None))
+        * np.ones((60, 3, 1))
+    )
+    data, white = (
+        2 * rng.poisson(n) + 100 for n in (1e4 * np.exp(-lines), np.full((6, 3, 32), 1e4))
+    )
     return lines, data, white, np.full((3, 3, 32), 100) + rng.integers(0, 2, (3, 3, 32))
 
 
@@ -45,17 +52,28 @@ def close(scan, rows=slice(None)):
     assert float(off.std()) < 0.03
 
 
-@pytest.mark.parametrize("unit", ["deg", "Degrees", "°", "rad", "radian", b"radians", np.array(["rad"], "S3")])
+@pytest.mark.parametrize(
+    "unit", ["deg", "Degrees", "°", "rad", "radian", b"radians", np.array(["rad"], "S3")]
+)
 def test_angles_in_degrees_and_rad_by_their_unit(exchange, unit):
     text = str(np.ravel(unit)[0])
-    rewritten(exchange, "exchange/theta", GEOMETRY.angles if "rad" in text else np.rad2deg(GEOMETRY.angles), unit)
+    rewritten(
+        exchange,
+        "exchange/theta",
+        GEOMETRY.angles if "rad" in text else np.rad2deg(GEOMETRY.angles),
+        unit,
+    )
     close(open_scan(exchange))
 
 
-@pytest.mark.parametrize("unit", ["mdeg", "mrad", "turn", "gon", "grad", "arcmin", "encoder counts"])
+@pytest.mark.parametrize(
+    "unit", ["mdeg", "mrad", "turn", "gon", "grad", "arcmin", "encoder counts"]
+)
 def test_angles_in_another_unit_are_refused_by_name_and_may_be_given(exchange, unit):
     rewritten(exchange, "exchange/theta", unit=unit)
-    with pytest.raises(ValueError, match=rf"are in '{unit}', which is neither deg nor rad: give angles_deg="):
+    with pytest.raises(
+        ValueError, match=rf"are in '{unit}', which is neither deg nor rad: give angles_deg="
+    ):
         open_scan(exchange)
     close(open_scan(exchange, angles_deg={"step": 3.0}))
 
@@ -63,7 +81,10 @@ def test_angles_in_another_unit_are_refused_by_name_and_may_be_given(exchange, u
 def test_angles_without_a_unit(exchange):
     rewritten(exchange, "exchange/theta", np.rad2deg(GEOMETRY.angles))
     close(open_scan(exchange))  # degrees, the format's default
-    for span, turns in ((GEOMETRY.angles, "1 half turn"), (np.linspace(0, 2 * np.pi, 60), "2 half turns")):
+    for span, turns in (
+        (GEOMETRY.angles, "1 half turn"),
+        (np.linspace(0, 2 * np.pi, 60), "2 half turns"),
+    ):
         rewritten(exchange, "exchange/theta", span)
         with pytest.warns(UserWarning, match=f"have no unit .* taken for rad, {turns}"):
             np.testing.assert_allclose(open_scan(exchange).geometry.angles, span)
@@ -75,10 +96,16 @@ def test_angles_without_a_unit(exchange):
 def test_uint16_that_was_stored_as_int16(exchange):
     """Some readings, all air frames, no dark frame: beyond 32767."""
     with h5py.File(exchange, "a") as file:
-        for name, values in (("data", 2 * DATA), ("data_white", 2 * WHITE), ("data_dark", 2 * DARK)):
+        for name, values in (
+            ("data", 2 * DATA),
+            ("data_white", 2 * WHITE),
+            ("data_dark", 2 * DARK),
+        ):
             del file[f"exchange/{name}"]
             file[f"exchange/{name}"] = values.astype(np.uint16).view(np.int16)
-    with pytest.warns(UserWarning, match=r"of type int16 reach down to -\d+: they are read as uint16"):
+    with pytest.warns(
+        UserWarning, match=r"of type int16 reach down to -\d+: they are read as uint16"
+    ):
         close(open_scan(exchange))
 
 
@@ -87,19 +114,38 @@ def test_what_a_file_lacks_is_asked_for_and_given(exchange, tmp_path):
         del file["exchange/theta"], file["exchange/data_white"], file["exchange/data_dark"]
     with pytest.raises(ValueError, match="it has no angles, /exchange/theta: give angles_deg="):
         open_scan(exchange)
-    with pytest.raises(ValueError, match=r"it has no white frames, /exchange/data_white: .* give air="):
+    with pytest.raises(
+        ValueError, match=r"it has no white frames, /exchange/data_white: .* give air="
+    ):
         open_scan(exchange, angles_deg={"step": 3.0})
-    (tmp_path / "angles.txt").write_text("\n".join(str(3.0 * k) for k in range(60)), encoding="utf-8")
+    (tmp_path / "angles.txt").write_text(
+        "\n".join(str(3.0 * k) for k in range(60)), encoding="utf-8"
+    )
     np.save(tmp_path / "white.npy", WHITE)
-    for angles, air in (({"step": 3.0}, 2e4 + 100), (np.rad2deg(GEOMETRY.angles), WHITE),
-                        (str(tmp_path / "angles.txt"), str(tmp_path / "white.npy"))):  # fmt: skip
+    for angles, air in (
+        ({"step": 3.0}, 2e4 + 100),
+        (np.rad2deg(GEOMETRY.angles), WHITE),
+        (str(tmp_path / "angles.txt"), str(tmp_path / "white.npy")),
+    ):
         close(open_scan(exchange, angles_deg=angles, air=air, dark=100.0))
-        close(open_scan(exchange, angles_deg=angles, air=air, dark=100.0, slices=slice(1, 3)), slice(1, 3))
+        close(
+            open_scan(exchange, angles_deg=angles, air=air, dark=100.0, slices=slice(1, 3)),
+            slice(1, 3),
+        )
     with pytest.raises(ValueError, match="angles_deg must be 60 angles, one a view"):
         open_scan(exchange, angles_deg=[0.0, 1.0], air=2e4)
     out = tmp_path / "v.h5"
-    command = ["reconstruct", str(exchange), "--out", str(out), "--air", str(tmp_path / "white.npy"), "--dark", "100",
-               "--no-progress"]  # fmt: skip
+    command = [
+        "reconstruct",
+        str(exchange),
+        "--out",
+        str(out),
+        "--air",
+        str(tmp_path / "white.npy"),
+        "--dark",
+        "100",
+        "--no-progress",
+    ]
     assert main([*command, "--angles-deg", "0:3"]) == 0
     first = Volume.load(out).data
     assert main([*command, "--angles-deg", str(tmp_path / "angles.txt")]) == 0
@@ -121,7 +167,9 @@ def test_nexus(tmp_path):
     close(open_scan(path, slices=slice(0, 2)), slice(0, 2))
     assert "slices" in own_options(path)
     close(open_scan(nexus(tmp_path / "b.h5", DATA, WHITE, GEOMETRY.angles, DARK, unit="rad")))
-    longer = nexus(tmp_path / "c.h5", DATA, (WHITE - 100) / 2 + 100, GEOMETRY.angles, DARK, times=(0.2, 0.1))
+    longer = nexus(
+        tmp_path / "c.h5", DATA, (WHITE - 100) / 2 + 100, GEOMETRY.angles, DARK, times=(0.2, 0.1)
+    )
     close(open_scan(longer))
 
 
@@ -141,15 +189,22 @@ def test_nexus_that_is_no_scan_or_several(tmp_path):
     close(open_scan(path, air=2e4 + 100))
     with h5py.File(tmp_path / "b.h5", "w") as file:
         file["table"] = np.zeros(3)
-    with pytest.raises(ValueError, match=r"b\.h5 is no scan of a known format: neither of torchpcct, nor Data"):
+    with pytest.raises(
+        ValueError, match=r"b\.h5 is no scan of a known format: neither of torchpcct, nor Data"
+    ):
         open_scan(tmp_path / "b.h5")
 
 
 @pytest.mark.parametrize("form", ["exchange", "nexus"])
-@pytest.mark.parametrize("kind", ["external link", "soft link out", "external storage", "virtual", "empty"])
+@pytest.mark.parametrize(
+    "kind", ["external link", "soft link out", "external storage", "virtual", "empty"]
+)
 def test_numbers_that_lie_in_other_files_are_refused_by_name(tmp_path, form, kind):
     if form == "exchange":
-        path, name = data_exchange(tmp_path / "a.h5", DATA, WHITE, GEOMETRY.angles, DARK), "exchange/data"
+        path, name = (
+            data_exchange(tmp_path / "a.h5", DATA, WHITE, GEOMETRY.angles, DARK),
+            "exchange/data",
+        )
     else:
         path = nexus(tmp_path / "a.nxs", DATA, WHITE, GEOMETRY.angles, DARK)
         name = "entry/instrument/detector/data"
@@ -165,14 +220,20 @@ def test_numbers_that_lie_in_other_files_are_refused_by_name(tmp_path, form, kin
             file["elsewhere"] = h5py.ExternalLink("other.h5", "/")
             file[name] = h5py.SoftLink("/elsewhere/data")
         elif kind == "external storage":
-            file.create_dataset(name, data.shape, data.dtype, external=[("other.raw", 0, data.nbytes)])
+            file.create_dataset(
+                name, data.shape, data.dtype, external=[("other.raw", 0, data.nbytes)]
+            )
         elif kind == "virtual":
             layout = h5py.VirtualLayout(data.shape, data.dtype)
             layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "data", data.shape)
             file.create_virtual_dataset(name, layout)
         else:  # 2 GiB of nothing
             file.create_dataset(name, (len(data), 2**10, 2**14), "u2", chunks=(1, 2**10, 2**10))
-    expected = "is packed into 0 MiB" if kind == "empty" else r"other\.(h5|raw).*copy all into one file first"
+    expected = (
+        "is packed into 0 MiB"
+        if kind == "empty"
+        else r"other\.(h5|raw).*copy all into one file first"
+    )
     with pytest.raises(ValueError, match=rf"a\.\w+ cannot be read as .*: .*{expected}"):
         open_scan(path)
 

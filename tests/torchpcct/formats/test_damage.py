@@ -31,8 +31,9 @@ def test_damaged_files(reader, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("reader", damage.READERS)
 def test_fuzzed_readers(reader, tmp_path):
-    """Other copies, as many as the time allows, in a process of its own: a crash of a C library or a hang is a failure
-    of this test, not of all. ``TORCHPCCT_FUZZ_MINUTES`` and ``TORCHPCCT_FUZZ_SEED`` change it."""
+    """Other copies, as many as the time allows, in a process of its own: a crash of a C library or
+    a hang is a failure of this test, not of all. ``TORCHPCCT_FUZZ_MINUTES`` and
+    ``TORCHPCCT_FUZZ_SEED`` change it."""
     limits = (10**6, 60 * MINUTES / len(damage.READERS), SEED + 1)
     command = [sys.executable, damage.__file__, reader, str(tmp_path / "files"), *map(str, limits)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=3600, check=False)

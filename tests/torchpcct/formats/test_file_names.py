@@ -27,7 +27,9 @@ def ordered(folder, names):
     st.integers(1, 40),
     st.integers(2, 130),
 )
-def test_numbers_that_count_up_in_equal_steps_decide_without_a_word(tmp_path_factory, form, first, step, count):
+def test_numbers_that_count_up_in_equal_steps_decide_without_a_word(
+    tmp_path_factory, form, first, step, count
+):
     folder = tmp_path_factory.getbasetemp()
     names = [form.format(first + step * k) for k in range(count)]
     assert ordered(folder, names) == names
@@ -57,7 +59,10 @@ def test_orders_that_are_clear_are_taken_without_a_word(tmp_path, names):
     ],
 )
 def test_where_text_and_numbers_differ_and_nothing_decides_the_order_is_said(tmp_path, names):
-    with pytest.warns(UserWarning, match=rf"leave their order open: they are read as {names[0]}.* \(by the numbers\)"):
+    with pytest.warns(
+        UserWarning,
+        match=rf"leave their order open: they are read as {names[0]}.* \(by the numbers\)",
+    ):
         assert ordered(tmp_path, names) == names
 
 
@@ -65,7 +70,12 @@ def stack(folder, readings, names, geometry=None, form="tif"):
     folder.mkdir(parents=True, exist_ok=True)
     for name, values in zip(names, READINGS, strict=True):
         tifffile.imwrite(folder / name, values)
-    text = {"readings": readings, "kind": "counts", "air": 3000, "geometry": geometry or geometry_values(GEOMETRY)}
+    text = {
+        "readings": readings,
+        "kind": "counts",
+        "air": 3000,
+        "geometry": geometry or geometry_values(GEOMETRY),
+    }
     (folder / "scan.yaml").write_text(yaml.safe_dump(text), encoding="utf-8")
     return open_scan(folder / "scan.yaml").counts.numpy()[0]
 
@@ -85,9 +95,11 @@ def test_patterns_find_endings_in_capitals_and_leave_hidden_files(tmp_path, endi
 
 def test_a_pattern_may_be_absolute_and_its_folder_may_hold_brackets(tmp_path):
     names = [f"p{k:02d}.tif" for k in range(12)]
-    found = stack(tmp_path / "scan [1]", str(tmp_path / "plain" / "p*.tif"), names) if (
-        stack(tmp_path / "plain", "p*.tif", names) is not None
-    ) else None  # fmt: skip
+    found = (
+        stack(tmp_path / "scan [1]", str(tmp_path / "plain" / "p*.tif"), names)
+        if (stack(tmp_path / "plain", "p*.tif", names) is not None)
+        else None
+    )
     np.testing.assert_array_equal(found, READINGS[:, 0])
     assert [path.name for path in matching("p*.tif", tmp_path / "scan [1]")] == names
     tifffile.imwrite(tmp_path / "v[0].tif", READINGS)
@@ -98,13 +110,21 @@ def test_a_pattern_may_be_absolute_and_its_folder_may_hold_brackets(tmp_path):
 
 def test_multi_page_files_in_capitals_and_of_several_kinds(tmp_path):
     tifffile.imwrite(tmp_path / "all.TIFF", READINGS[:, 0])
-    text = {"readings": "all.TIFF", "kind": "counts", "air": 3000, "geometry": geometry_values(GEOMETRY)}
+    text = {
+        "readings": "all.TIFF",
+        "kind": "counts",
+        "air": 3000,
+        "geometry": geometry_values(GEOMETRY),
+    }
     (tmp_path / "scan.yaml").write_text(yaml.safe_dump(text), encoding="utf-8")
     np.testing.assert_array_equal(open_scan(tmp_path / "scan.yaml").counts.numpy(), READINGS[:, 0])
     with tifffile.TiffWriter(tmp_path / "all.TIFF") as file:
         file.write(READINGS[0])
         file.write(np.zeros((3, 5), np.uint16))
-    with pytest.raises(ValueError, match=r"all\.TIFF cannot be read as a TIFF image: it holds images of several kinds"):
+    with pytest.raises(
+        ValueError,
+        match=r"all\.TIFF cannot be read as a TIFF image: it holds images of several kinds",
+    ):
         open_scan(tmp_path / "scan.yaml")
 
 
@@ -124,10 +144,20 @@ def test_readings_of_16_bits_that_were_stored_with_a_sign(tmp_path):
     """Far below 0: 40000 and more of a camera; a little below 0: what is left of the dark."""
     counts = np.linspace(100, 60000, 12 * 16).reshape(12, 16).astype(np.uint16)
     np.save(tmp_path / "n.npy", counts.view(np.int16))
-    text = {"readings": "n.npy", "kind": "counts", "air": 65000, "dark": 1.0,
-            "electronic_noise": 3.0, "geometry": geometry_values(GEOMETRY)}  # fmt: skip
+    text = {
+        "readings": "n.npy",
+        "kind": "counts",
+        "air": 65000,
+        "dark": 1.0,
+        "electronic_noise": 3.0,
+        "geometry": geometry_values(GEOMETRY),
+    }
     (tmp_path / "scan.yaml").write_text(yaml.safe_dump(text), encoding="utf-8")
-    with pytest.warns(UserWarning, match="readings of type int16 reach down to -.*: they are read as uint16"):
-        np.testing.assert_array_equal(open_scan(tmp_path / "scan.yaml").counts.numpy(), counts - 1.0)
+    with pytest.warns(
+        UserWarning, match="readings of type int16 reach down to -.*: they are read as uint16"
+    ):
+        np.testing.assert_array_equal(
+            open_scan(tmp_path / "scan.yaml").counts.numpy(), counts - 1.0
+        )
     np.save(tmp_path / "n.npy", np.arange(-20, 172).reshape(12, 16).astype(np.int16))
     assert float(open_scan(tmp_path / "scan.yaml").counts.min()) == -21.0

@@ -1,4 +1,5 @@
-"""Files that would never end, fill the memory, or lead elsewhere: refused in one sentence that names them."""
+"""Files that would never end, fill the memory, or lead elsewhere: refused in one sentence that
+names them."""
 
 import contextlib
 import gzip
@@ -51,7 +52,13 @@ def endless(request, tmp_path):
 
 def described(folder, **changed):
     np.save(folder / "n.npy", np.full((6, 8), 50.0))
-    text = {"readings": "n.npy", "kind": "counts", "air": 100.0, "geometry": geometry_values(GEOMETRY), **changed}
+    text = {
+        "readings": "n.npy",
+        "kind": "counts",
+        "air": 100.0,
+        "geometry": geometry_values(GEOMETRY),
+        **changed,
+    }
     (folder / "scan.yaml").write_text(yaml.safe_dump(text), encoding="utf-8")
     return folder / "scan.yaml"
 
@@ -78,7 +85,20 @@ def test_yaml_that_names_what_never_ends(tmp_path, endless):
 
 
 @pytest.mark.parametrize(
-    "name", ["a.h5", "a.nxs", "a.yaml", "a.txrm", "a.xtekct", "a.mat", "a.prep", "v.nii", "v.nii.gz", "v.mha", "v.dcm"]
+    "name",
+    [
+        "a.h5",
+        "a.nxs",
+        "a.yaml",
+        "a.txrm",
+        "a.xtekct",
+        "a.mat",
+        "a.prep",
+        "v.nii",
+        "v.nii.gz",
+        "v.mha",
+        "v.dcm",
+    ],
 )
 def test_files_of_every_format_that_never_end(tmp_path, name):
     (tmp_path / name).symlink_to("/dev/zero")
@@ -126,10 +146,18 @@ def _nifti_header(shape):
 
 def test_nifti_that_unpacks_to_more_than_it_says_or_than_fits(tmp_path):
     _gzip(tmp_path / "a.nii.gz", _nifti_header((5, 4, 3)), 2**25)
-    with little_memory(), pytest.raises(ValueError, match=r"a\.nii\.gz .*: it unpacks to more than the 592 bytes"):
+    with (
+        little_memory(),
+        pytest.raises(ValueError, match=r"a\.nii\.gz .*: it unpacks to more than the 592 bytes"),
+    ):
         Volume.load(tmp_path / "a.nii.gz")
     _gzip(tmp_path / "b.nii.gz", _nifti_header((2000, 2000, 1000)), 2**24)
-    with little_memory(), pytest.raises(ValueError, match=r"b\.nii\.gz .* packed into .* so empty|b\.nii\.gz .*memory"):
+    with (
+        little_memory(),
+        pytest.raises(
+            ValueError, match=r"b\.nii\.gz .* packed into .* so empty|b\.nii\.gz .*memory"
+        ),
+    ):
         Volume.load(tmp_path / "b.nii.gz")
 
 
@@ -157,7 +185,10 @@ def test_dicom_that_inflates_to_more_than_an_image(tmp_path):
     sound = Volume.load(_deflated(tmp_path / "a.dcm", 40))
     assert float(sound.data.abs().max()) == 0.0
     shutil.rmtree(tmp_path / "plain")
-    with little_memory(), pytest.raises(ValueError, match=r"b\.dcm .* deflated data set is of more than 128 MiB"):
+    with (
+        little_memory(),
+        pytest.raises(ValueError, match=r"b\.dcm .* deflated data set is of more than 128 MiB"),
+    ):
         Volume.load(_deflated(tmp_path / "b.dcm", 5 * 2**25))
 
 
@@ -168,11 +199,17 @@ def test_tiffs_and_arrays_of_absurd_sizes(tmp_path):
             file.pages[0].tags[name].overwrite(size)
     with (
         little_memory(),
-        pytest.raises(ValueError, match=r"a\.tif cannot be read as a TIFF image: the image of 4 GiB"),
+        pytest.raises(
+            ValueError, match=r"a\.tif cannot be read as a TIFF image: the image of 4 GiB"
+        ),
     ):
         open_scan(described(tmp_path, readings="a.tif"))
     np.save(tmp_path / "b.npy", np.zeros((6, 8)))
-    content = (tmp_path / "b.npy").read_bytes().replace(b"(6, 8), }              ", b"(600000, 80000), }     ")
+    content = (
+        (tmp_path / "b.npy")
+        .read_bytes()
+        .replace(b"(6, 8), }              ", b"(600000, 80000), }     ")
+    )
     (tmp_path / "b.npy").write_bytes(content)
     assert b"600000" in content
     with little_memory(), pytest.raises(ValueError, match=r"b\.npy cannot be read as"):
@@ -199,5 +236,7 @@ def test_files_of_ours_that_were_made_to_lead_elsewhere(tmp_path, kind):
         del file[name]
         file[name] = h5py.ExternalLink("other.h5", "/x")
     seal(path)
-    with pytest.raises(ValueError, match=rf"own\.h5 .*: its /{name} is a link to another file, other\.h5"):
+    with pytest.raises(
+        ValueError, match=rf"own\.h5 .*: its /{name} is a link to another file, other\.h5"
+    ):
         load(path)

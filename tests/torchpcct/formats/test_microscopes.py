@@ -1,4 +1,5 @@
-"""Scans of laboratory machines (Nikon, Zeiss) and MATLAB arrays, written as their descriptions say."""
+"""Scans of laboratory machines (Nikon, Zeiss) and MATLAB arrays, written as their descriptions
+say."""
 
 import math
 
@@ -15,7 +16,10 @@ from torchpcct.formats.scans import open_scan
 from torchpcct.vector_geometry import VectorGeometry
 
 MU = 0.02
-BODY = [Ellipsoid((2.0, -3.0, 0.5), (9.0, 12.0, 30.0), value=MU), Ellipsoid((7.0, 4.0, 0.0), (3.0, 3.0, 2.0), value=MU)]
+BODY = [
+    Ellipsoid((2.0, -3.0, 0.5), (9.0, 12.0, 30.0), value=MU),
+    Ellipsoid((7.0, 4.0, 0.0), (3.0, 3.0, 2.0), value=MU),
+]
 NIKON = ConeBeam(full_turn(24, math.radians(120.0)), 300.0, 500.0, 48, 4, (1.5, 1.7), (0.0, 0.8))
 ZEISS = ConeBeam(-full_turn(24) - math.pi / 2, 300.0, 500.0, 48, 4, 1.7)
 WHITE = 60000.0
@@ -23,7 +27,9 @@ WHITE = 60000.0
 
 def same(scan, geometry, lines, rows=slice(None)):
     assert scan.geometry.shape[1:] == lines[:, rows].shape[1:]
-    np.testing.assert_allclose(np.exp(1j * scan.geometry.angles), np.exp(1j * geometry.angles), atol=1e-5)
+    np.testing.assert_allclose(
+        np.exp(1j * scan.geometry.angles), np.exp(1j * geometry.angles), atol=1e-5
+    )
     np.testing.assert_allclose(scan.line_integrals().numpy(), lines[:, rows], atol=2e-3)
 
 
@@ -33,13 +39,20 @@ def test_nikon(tmp_path):
     scan = open_scan(path, mu_water=MU)
     same(scan, NIKON, lines)
     g = scan.geometry
-    assert (g.sod, g.sdd, g.pitch, g.offset) == (300.0, 500.0, (1.5, 1.7), pytest.approx((0.0, 0.8)))
+    assert (g.sod, g.sdd, g.pitch, g.offset) == (
+        300.0,
+        500.0,
+        (1.5, 1.7),
+        pytest.approx((0.0, 0.8)),
+    )
     inside = reconstruct(scan, VolumeGrid((1, 4, 4), 1.0, (0.0, 0.0, -3.0)), "fbp").data
     assert float(inside.mean().abs()) < 40
     same(open_scan(path, slices=slice(1, 3)), NIKON, lines, slice(1, 3))
     assert open_scan(path, slices=slice(1, 3)).geometry == open_scan(path).geometry.with_rows(1, 2)
     (tmp_path / "part" / "part_0024.tif").unlink()
-    with pytest.raises(ValueError, match=r"part\.xtekct cannot be read as .*: it says 24 Projections, 23 images"):
+    with pytest.raises(
+        ValueError, match=r"part\.xtekct cannot be read as .*: it says 24 Projections, 23 images"
+    ):
         open_scan(path)
 
 
@@ -71,15 +84,22 @@ def test_zeiss(tmp_path):
 
 
 def test_zeiss_with_images_that_were_shifted_and_without_a_reference(tmp_path):
-    lines, shifts = line_integrals(ZEISS, BODY, sub=1), {"x": np.arange(24) % 3 - 1.0, "y": np.zeros(24)}
+    lines, shifts = (
+        line_integrals(ZEISS, BODY, sub=1),
+        {"x": np.arange(24) % 3 - 1.0, "y": np.zeros(24)},
+    )
     path = txrm(tmp_path / "a.txrm", WHITE * np.exp(-lines), ZEISS, np.full((4, 48), WHITE), shifts)
     expected = VectorGeometry.of(ZEISS).shifted(columns=shifts["x"])
     np.testing.assert_allclose(open_scan(path).geometry.vectors, expected.vectors, atol=1e-3)
-    renamed = path.read_bytes().replace("ReferenceData".encode("utf-16-le"), "ReferencyData".encode("utf-16-le"))
+    renamed = path.read_bytes().replace(
+        "ReferenceData".encode("utf-16-le"), "ReferencyData".encode("utf-16-le")
+    )
     path.write_bytes(renamed)
     with pytest.raises(ValueError, match="it has no reference image: give air="):
         open_scan(path)
-    np.testing.assert_allclose(open_scan(path, air=WHITE).line_integrals().numpy(), lines, atol=2e-3)
+    np.testing.assert_allclose(
+        open_scan(path, air=WHITE).line_integrals().numpy(), lines, atol=2e-3
+    )
 
 
 PARALLEL = ParallelBeam(np.arange(30) * math.pi / 30, 64, 1.0)
@@ -98,14 +118,20 @@ def mat73(path, **arrays):
 @pytest.mark.parametrize("turned", [False, True])
 def test_matlab_sinograms(tmp_path, new, turned):
     sinogram = SINOGRAM.T if turned else SINOGRAM
-    arrays = {"sinogram": sinogram, "angles": np.arange(30.0)[None], "name": np.array([65, 66])[None]}
+    arrays = {
+        "sinogram": sinogram,
+        "angles": np.arange(30.0)[None],
+        "name": np.array([65, 66])[None],
+    }
     path = mat73(tmp_path / "s.mat", **arrays) if new else tmp_path / "s.mat"
     if not new:
         savemat(path, {**arrays, "note": "text"}, do_compression=True)
     for options in ({}, {"variable": "sinogram"}):
         scan = open_scan(path, PARALLEL, photons=1e6, mu_water=MU, **options)
         np.testing.assert_allclose(scan.line_integrals().numpy(), SINOGRAM, atol=1e-5)
-    with pytest.raises(ValueError, match=r"s\.mat, a MATLAB array: such files do not hold the geometry"):
+    with pytest.raises(
+        ValueError, match=r"s\.mat, a MATLAB array: such files do not hold the geometry"
+    ):
         open_scan(path)
     with pytest.raises(ValueError, match=r"unknown variable 'm': use one of .*sinogram"):
         open_scan(path, PARALLEL, variable="m")
@@ -114,16 +140,24 @@ def test_matlab_sinograms(tmp_path, new, turned):
 
 
 def test_matlab_readings_stacks_and_arrays_that_leave_it_open(tmp_path):
-    counts = np.rint(1e4 * np.exp(-np.stack([SINOGRAM, 0.5 * SINOGRAM], -1)))  # (views, columns, slices)
+    # (views, columns, slices)
+    counts = np.rint(1e4 * np.exp(-np.stack([SINOGRAM, 0.5 * SINOGRAM], -1)))
     savemat(tmp_path / "n.mat", {"n": counts, "other": counts[..., 0]})
-    with pytest.raises(ValueError, match=r"it holds 2 arrays: give variable=, .*n \(30, 64, 2\), other \(30, 64\)"):
+    with pytest.raises(
+        ValueError, match=r"it holds 2 arrays: give variable=, .*n \(30, 64, 2\), other \(30, 64\)"
+    ):
         open_scan(tmp_path / "n.mat", PARALLEL)
     scan = open_scan(tmp_path / "n.mat", PARALLEL, variable="n", air=1e4)
     np.testing.assert_allclose(scan.line_integrals()[0].numpy(), SINOGRAM, atol=0.02)
     square = ParallelBeam(PARALLEL.angles, 30, 1.0)
     savemat(tmp_path / "s.mat", {"s": SINOGRAM[:, :30]})
-    with pytest.warns(UserWarning, match=r"fits the geometry \(30, 30\) in several ways .*: it is taken as it stands"):
+    with pytest.warns(
+        UserWarning,
+        match=r"fits the geometry \(30, 30\) in several ways .*: it is taken as it stands",
+    ):
         open_scan(tmp_path / "s.mat", square)
     savemat(tmp_path / "c.mat", {"s": SINOGRAM * 1j})
-    with pytest.raises(ValueError, match=r"c\.mat cannot be read as a MATLAB file: its variable holds complex128"):
+    with pytest.raises(
+        ValueError, match=r"c\.mat cannot be read as a MATLAB file: its variable holds complex128"
+    ):
         open_scan(tmp_path / "c.mat", PARALLEL)

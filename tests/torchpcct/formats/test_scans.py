@@ -1,4 +1,5 @@
-"""Readers of foreign scans: files that h5py, pydicom, tifffile and numpy wrote, and damaged ones."""
+"""Readers of foreign scans: files that h5py, pydicom, tifffile and numpy wrote, and damaged
+ones."""
 
 import math
 import shutil
@@ -54,7 +55,9 @@ def test_tooth(tmp_path):
     assert float(volume[1, 12:16, 10:14].abs().max()) < 60
     with h5py.File(tmp_path / "tooth.h5", "a") as file:
         del file["exchange/theta"]
-    with pytest.raises(ValueError, match=r"tooth\.h5 cannot be read as a Data Exchange file: it has no angles"):
+    with pytest.raises(
+        ValueError, match=r"tooth\.h5 cannot be read as a Data Exchange file: it has no angles"
+    ):
         open_scan(path)
 
 
@@ -66,7 +69,9 @@ def test_without_a_pixel_size_lengths_are_in_pixels(tmp_path, size, unit):
         del file["measurement"]
         if size is not None:
             file["measurement/instrument/detector/pixel_size"] = size
-            file["measurement/instrument/detector/pixel_size"].attrs["units"] = np.array([unit.encode()])
+            file["measurement/instrument/detector/pixel_size"].attrs["units"] = np.array(
+                [unit.encode()]
+            )
     scan, known = open_scan(path), open_scan(path, pitch=0.5, mu_water=0.04)
     assert (scan.unit, scan.geometry.pitch, known.unit) == ("pixel^-1", 1.0, "HU")
     grids = [VolumeGrid((4, 32, 32), pitch) for pitch in (1.0, 0.5)]
@@ -81,9 +86,12 @@ def test_without_a_pixel_size_lengths_are_in_pixels(tmp_path, size, unit):
 def test_pixel_sizes_in_every_unit(tmp_path):
     path = tooth(tmp_path / "tooth.h5")
     for mm, units in (
-        (1e3, "m meter meters metre metres"), (10.0, "cm"), (1.0, "mm millimeter millimeters millimetre millimetres"),
-        (1e-3, "um µm μm micron microns micrometer micrometers micrometre"), (1e-6, "nm"),
-    ):  # fmt: skip
+        (1e3, "m meter meters metre metres"),
+        (10.0, "cm"),
+        (1.0, "mm millimeter millimeters millimetre millimetres"),
+        (1e-3, "um µm μm micron microns micrometer micrometers micrometre"),
+        (1e-6, "nm"),
+    ):
         for unit in units.split():
             with h5py.File(path, "a") as file:
                 file["measurement/instrument/detector/pixel_size"].attrs["units"] = unit
@@ -93,7 +101,12 @@ def test_pixel_sizes_in_every_unit(tmp_path):
 
 def test_angles_start_where_they_are_said_to(tmp_path):
     """In a geometry and in a stack's description: 30°, 32°, …"""
-    written = {"kind": "parallel", "angles_deg": {"start": 30, "step": 2, "count": 4}, "columns": 5, "pitch": 1.0}
+    written = {
+        "kind": "parallel",
+        "angles_deg": {"start": 30, "step": 2, "count": 4},
+        "columns": 5,
+        "pitch": 1.0,
+    }
     np.save(tmp_path / "lines.npy", np.zeros((4, 5)))
     text = {"readings": "lines.npy", "kind": "line_integrals", "geometry": written}
     (tmp_path / "stack.yaml").write_text(yaml.safe_dump(text), encoding="utf-8")
@@ -103,7 +116,8 @@ def test_angles_start_where_they_are_said_to(tmp_path):
 
 @pytest.mark.parametrize("frames", ["constant", "one", "averaged"])
 def test_white_frames_that_do_not_differ(tmp_path, frames):
-    """Averages that were stored, several times or once: the photons come from the noise of the readings."""
+    """Averages that were stored, several times or once: the photons come from the noise of the
+    readings."""
     rng, lines = np.random.default_rng(1), line_integrals(PARALLEL, BODY, sub=1)
     white = np.full((2, 64), 3200.0)
     data = 8 * rng.poisson(400 * np.exp(-np.stack([lines, lines], 1)))
@@ -118,7 +132,11 @@ def test_white_frames_that_do_not_differ(tmp_path, frames):
 def test_options_fit_every_format_or_are_refused_by_name(tmp_path):
     lines = line_integrals(PARALLEL, BODY, sub=1)
     np.save(tmp_path / "lines.npy", np.stack([lines] * 3))
-    text = {"readings": "lines.npy", "kind": "line_integrals", "geometry": geometry_values(PARALLEL)}
+    text = {
+        "readings": "lines.npy",
+        "kind": "line_integrals",
+        "geometry": geometry_values(PARALLEL),
+    }
     (tmp_path / "stack.yaml").write_text(yaml.safe_dump(text), encoding="utf-8")
     Scan.from_counts(np.full(CONE.shape, 50.0), CONE, air=100.0).save(tmp_path / "own.h5")
     lines.astype("<f4").tofile(tmp_path / "a.prep")
@@ -135,9 +153,17 @@ def test_options_fit_every_format_or_are_refused_by_name(tmp_path):
             else:
                 g = scan.geometry
                 kept = scan.counts.shape[1 if g.has_rows else 0]  # of a cone beam its rows
-                seen = {"axis": axis_column(g), "pitch": g.pitch, "slices": slice(1, 1 + kept),
-                        "mu_water": scan.linearisation.mu_ref, "photons": float(scan.air.max())}  # fmt: skip
-                assert seen[option] == (pytest.approx(value) if option != "slices" else value), (name, option)
+                seen = {
+                    "axis": axis_column(g),
+                    "pitch": g.pitch,
+                    "slices": slice(1, 1 + kept),
+                    "mu_water": scan.linearisation.mu_ref,
+                    "photons": float(scan.air.max()),
+                }
+                assert seen[option] == (pytest.approx(value) if option != "slices" else value), (
+                    name,
+                    option,
+                )
         with pytest.raises(TypeError, match=r"gian: no option of .*, which takes .*axis, "):
             open_scan(tmp_path / name, gian=3.0)
     expected = {("tooth.h5", "photons"), ("a.prep", "slices")}
@@ -146,10 +172,14 @@ def test_options_fit_every_format_or_are_refused_by_name(tmp_path):
 
 
 def test_stripes_of_a_part_of_the_turn_go_and_the_rest_stays():
-    """Cells whose gain is off for 60 to 120 of 240 views, or that read nothing; the object hardly changes."""
+    """Cells whose gain is off for 60 to 120 of 240 views, or that read nothing; the object
+    hardly changes."""
     g = ParallelBeam(np.arange(240) * math.pi / 240, 128, 1.0)
-    bodies = [Ellipsoid((3.0, -4.0), (45.0, 55.0), value=0.02), Ellipsoid((20.0, 15.0), (9.0, 6.0), value=0.03),
-              Ellipsoid((-18.0, -25.0), (7.0, 12.0), value=-0.015)]  # fmt: skip
+    bodies = [
+        Ellipsoid((3.0, -4.0), (45.0, 55.0), value=0.02),
+        Ellipsoid((20.0, 15.0), (9.0, 6.0), value=0.03),
+        Ellipsoid((-18.0, -25.0), (7.0, 12.0), value=-0.015),
+    ]
     p = line_integrals(g, bodies, sub=2)
     n = np.random.default_rng(0).poisson(3e4 * np.exp(-p)).astype(float)
     gain, zero = np.ones(n.shape), np.zeros(n.shape, bool)
@@ -159,7 +189,11 @@ def test_stripes_of_a_part_of_the_turn_go_and_the_rest_stays():
     sound, striped = (cleaned(s).line_integrals().numpy() for s in scans)
     noise = float((scans[0].line_integrals().numpy() - p).std())
     assert float((sound - p).std()) < 1.02 * noise
-    for views, columns in ((slice(35, 145), 40), (slice(105, 215), slice(71, 73)), (slice(0, 55), 76)):
+    for views, columns in (
+        (slice(35, 145), 40),
+        (slice(105, 215), slice(71, 73)),
+        (slice(0, 55), 76),
+    ):
         assert abs(float((striped - sound)[views, columns].mean())) < 0.035  # 0.06 to 0.08
     assert np.abs((striped - sound)[zero]).max() < 0.5  # 9
     assert float((striped - p).std()) < 1.1 * noise
@@ -167,7 +201,8 @@ def test_stripes_of_a_part_of_the_turn_go_and_the_rest_stays():
 
 
 def test_cleaned_keeps_the_scan_and_its_weights(tmp_path):
-    """A cell that changed its gain, a stray gamma; a cell without signal is dead though its mean is not quite 0."""
+    """A cell that changed its gain, a stray gamma; a cell without signal is dead though its mean
+    is not quite 0."""
     path = tooth(tmp_path / "tooth.h5")
     clean = open_scan(path, slices=slice(0, 2))
     with h5py.File(path, "a") as file:
@@ -180,7 +215,10 @@ def test_cleaned_keeps_the_scan_and_its_weights(tmp_path):
     assert raw.dead is not None
     assert bool(raw.dead[1, :, 33].all())
     found = cleaned(raw)
-    wrong = [float((s.line_integrals()[0] - clean.line_integrals()[0])[:, [20, 40]].abs().max()) for s in (raw, found)]
+    wrong = [
+        float((s.line_integrals()[0] - clean.line_integrals()[0])[:, [20, 40]].abs().max())
+        for s in (raw, found)
+    ]
     assert wrong[0] > 0.5
     assert wrong[1] < 0.1
     live = found.weights()[0][:, :30]
@@ -205,8 +243,14 @@ def test_stacks_with_a_description(tmp_path, form):
         np.save(tmp_path / "p" / "all.npy", counts)
         name = "p/all.npy"
     np.save(tmp_path / "dead.npy", np.zeros((3, 64), np.uint8))
-    text = {"readings": name, "kind": "counts", "air": 5e4, "dead": "dead.npy", "mu_water": MU,
-            "geometry": geometry_values(CONE)}  # fmt: skip
+    text = {
+        "readings": name,
+        "kind": "counts",
+        "air": 5e4,
+        "dead": "dead.npy",
+        "mu_water": MU,
+        "geometry": geometry_values(CONE),
+    }
     path = tmp_path / "scan.yaml"
     path.write_text(yaml.safe_dump(text), encoding="utf-8")
     scan = open_scan(path)
@@ -217,12 +261,16 @@ def test_stacks_with_a_description(tmp_path, form):
         open_scan(path)
 
 
-@pytest.mark.parametrize("geometry", [PARALLEL, FanBeam(full_turn(7), 50.0, 90.0, 9, 1.0, 0.2, "curved"), CONE])
+@pytest.mark.parametrize(
+    "geometry", [PARALLEL, FanBeam(full_turn(7), 50.0, 90.0, 9, 1.0, 0.2, "curved"), CONE]
+)
 def test_geometries_as_yaml(geometry, tmp_path):
     back = geometry_of(yaml.safe_load(yaml.safe_dump(geometry_values(geometry))))
     np.testing.assert_allclose(back.angles, geometry.angles, atol=1e-12)
     assert geometry_values(back).keys() == geometry_values(geometry).keys()
-    (tmp_path / "a.txt").write_text("\n".join(map(str, np.rad2deg(geometry.angles))), encoding="utf-8")
+    (tmp_path / "a.txt").write_text(
+        "\n".join(map(str, np.rad2deg(geometry.angles))), encoding="utf-8"
+    )
     values = geometry_values(geometry) | {"angles_deg": "a.txt"}
     np.testing.assert_allclose(geometry_of(values, tmp_path).angles, geometry.angles, atol=1e-12)
     with pytest.raises(ValueError, match=r"unknown in a .* geometry: sdds"):
@@ -237,7 +285,11 @@ def test_catsim(tmp_path):
     scan = open_scan(tmp_path / "a.prep", CONE, mu_water=MU, photons=1e5)
     np.testing.assert_allclose(scan.line_integrals().numpy(), lines, atol=1e-5)
     air, dark = np.full(CONE.shape[1:], 1e4), np.full(CONE.shape[1:], 50.0)
-    for end, values in (("scan", dark + (air - dark) * np.exp(-lines)), ("air", air), ("offset", dark)):
+    for end, values in (
+        ("scan", dark + (air - dark) * np.exp(-lines)),
+        ("air", air),
+        ("offset", dark),
+    ):
         values.astype("<f4").tofile(tmp_path / f"b.{end}")
     scan = open_scan(tmp_path / "b.scan", CONE, mu_water=MU)
     np.testing.assert_allclose(scan.line_integrals().numpy(), lines, atol=2e-3)
@@ -276,17 +328,24 @@ def test_helical_and_flying_spots_are_refused(tmp_path):
     assert read_dicom_ct_pd(flying, ignore_flying_spot=True).motion is None
 
 
-BALLS = [Ellipsoid((0.5, 2.0, -3.0), (6.0, 14.0, 18.0), value=MU), Ellipsoid((1.0, 6.0, 5.0), 3.0, value=MU)]
+BALLS = [
+    Ellipsoid((0.5, 2.0, -3.0), (6.0, 14.0, 18.0), value=MU),
+    Ellipsoid((1.0, 6.0, 5.0), 3.0, value=MU),
+]
 
 
 def _deflected(geometry, angle, height, radius):
     """Exact line integrals of BALLS from a deflected spot to a detector that stays."""
     g, lines = geometry, []
     for beta in g.angles:
-        e_r, e_t = np.array([[math.cos(beta), math.sin(beta), 0.0], [-math.sin(beta), math.cos(beta), 0.0]])
+        e_r, e_t = np.array(
+            [[math.cos(beta), math.sin(beta), 0.0], [-math.sin(beta), math.cos(beta), 0.0]]
+        )
         turned = np.array([math.cos(beta + angle), math.sin(beta + angle), 0.0])
         source = (g.sod + radius) * turned + [0.0, 0.0, height]
-        cells = g.sod * e_r + g.sdd * np.stack([np.cos(g.fan_angles), np.sin(g.fan_angles)], -1) @ np.stack([-e_r, e_t])
+        cells = g.sod * e_r + g.sdd * np.stack(
+            [np.cos(g.fan_angles), np.sin(g.fan_angles)], -1
+        ) @ np.stack([-e_r, e_t])
         rays = cells + np.array([0.0, 0.0, 1.0]) * g.row_positions[:, None, None] - source
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         lines.append(sum(ball.along(source, rays) for ball in BALLS))
@@ -301,21 +360,29 @@ def test_every_second_view_of_a_flying_spot_is_a_scan_from_where_the_spot_was(tm
     for k, spot in enumerate(spots):
         lines[k::2] = _deflected(CURVED.select(slice(k, None, 2)), *spot)
     folder = ct_pd(tmp_path / "ffs", lines, CURVED, spot="FFSXZ", shifts=spots)
-    with pytest.raises(ValueError, match=r"focal spot flies \(FFSXZ\) between 2 positions: pass spot=0"):
+    with pytest.raises(
+        ValueError, match=r"focal spot flies \(FFSXZ\) between 2 positions: pass spot=0"
+    ):
         open_scan(folder)
     for k, (angle, height, radius) in enumerate(spots):
         if every:
             (tmp_path / f"half{k}").mkdir()
-            for path in sorted(folder.iterdir())[::-1][k::2]:  # names run against the instance numbers
+            # names run against the instance numbers
+            for path in sorted(folder.iterdir())[::-1][k::2]:
                 shutil.copy(path, tmp_path / f"half{k}")
         scan = open_scan(tmp_path / f"half{k}") if every else open_scan(folder, spot=k)
         g = scan.geometry
         assert g.sod == pytest.approx(300.0 + radius, abs=1e-3)
         np.testing.assert_allclose(g.angles, CURVED.angles[k::2] + angle, atol=1e-5)
         assert g.offset[0] == pytest.approx(CURVED.offset[0] - height, abs=1e-5)
-        seen = [replace(ball, center=(ball.center[0] - height, *ball.center[1:])) for ball in BALLS]  # z from the spot
-        np.testing.assert_allclose(scan.line_integrals().numpy(), line_integrals(g, seen, sub=1), atol=3e-3)
-    with pytest.raises(ValueError, match="spot must be one of the 2 positions of the focal spot, got 2"):
+        # z from the spot
+        seen = [replace(ball, center=(ball.center[0] - height, *ball.center[1:])) for ball in BALLS]
+        np.testing.assert_allclose(
+            scan.line_integrals().numpy(), line_integrals(g, seen, sub=1), atol=3e-3
+        )
+    with pytest.raises(
+        ValueError, match="spot must be one of the 2 positions of the focal spot, got 2"
+    ):
         open_scan(folder, spot=2)
 
 
@@ -328,10 +395,14 @@ def test_rtk_matrices(tmp_path):
         rays = np.stack([u / np.linalg.norm(u), v / np.linalg.norm(v), centre - source], 1)
         inverse = np.linalg.inv(rays) * (-1.0) ** k * (1.0 + k)
         matrix = np.concatenate([inverse, -(inverse @ source)[:, None]], 1)
-        parts.append(f"<Projection><Matrix>{' '.join(map(str, matrix.ravel()))}</Matrix></Projection>")
+        parts.append(
+            f"<Projection><Matrix>{' '.join(map(str, matrix.ravel()))}</Matrix></Projection>"
+        )
     path = tmp_path / "geometry.xml"
     distance = "<SourceToDetectorDistance>500</SourceToDetectorDistance>"
-    path.write_text(f"<RTKThreeDCircularGeometry>{distance}{''.join(parts)}</RTKThreeDCircularGeometry>")
+    path.write_text(
+        f"<RTKThreeDCircularGeometry>{distance}{''.join(parts)}</RTKThreeDCircularGeometry>"
+    )
     geometry = read_rtk(path, CONE.columns, CONE.rows, CONE.pitch)
     np.testing.assert_allclose(geometry.vectors, VectorGeometry.of(CONE).vectors, atol=1e-8)
     circular = geometry.as_circular()
@@ -339,7 +410,9 @@ def test_rtk_matrices(tmp_path):
     np.testing.assert_allclose(circular[0].angles % (2 * math.pi), CONE.angles, atol=1e-9)
 
 
-LAUGHS = "\n".join(["a0: &a0 [x, x]", *(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 12))])
+LAUGHS = "\n".join(
+    ["a0: &a0 [x, x]", *(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 12))]
+)
 
 
 @pytest.mark.parametrize(
@@ -356,14 +429,26 @@ LAUGHS = "\n".join(["a0: &a0 [x, x]", *(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}']
     ],
 )
 def test_yaml_of_users_is_bounded(tmp_path, text, expected_text):
-    """Twelve lines of aliases to aliases hung every reader, and a bad geometry ended in a traceback."""
+    """Twelve lines of aliases to aliases hung every reader, and a bad geometry ended in a
+    traceback."""
     path = tmp_path / "a.yaml"
     path.write_bytes(text.encode("latin-1" if expected_text is None else "utf-8"))
-    readers = [lambda: read_yaml(path, "a geometry"), lambda: open_scan(path), lambda: read_config(path)]
+    readers = [
+        lambda: read_yaml(path, "a geometry"),
+        lambda: open_scan(path),
+        lambda: read_config(path),
+    ]
     for read in readers:
-        with pytest.raises(ValueError, match=f"a.yaml cannot be read as .*: .*{expected_text or 'codec'}"):
+        with pytest.raises(
+            ValueError, match=f"a.yaml cannot be read as .*: .*{expected_text or 'codec'}"
+        ):
             read()
-    assert main(["reconstruct", str(tmp_path), "--geometry", str(path), "--out", str(tmp_path / "v.h5")]) == 2
+    assert (
+        main(
+            ["reconstruct", str(tmp_path), "--geometry", str(path), "--out", str(tmp_path / "v.h5")]
+        )
+        == 2
+    )
 
 
 def test_yaml_with_anchors_is_read(tmp_path):
@@ -371,4 +456,10 @@ def test_yaml_with_anchors_is_read(tmp_path):
         "a: &a {b: [1, 2]}\nc: *a\nd: &e 3\nf: [*e, *e]\ng: {<<: *a, h: 4}", encoding="utf-8"
     )
     values = read_yaml(tmp_path / "a.yaml", "values")
-    assert values == {"a": {"b": [1, 2]}, "c": {"b": [1, 2]}, "d": 3, "f": [3, 3], "g": {"b": [1, 2], "h": 4}}
+    assert values == {
+        "a": {"b": [1, 2]},
+        "c": {"b": [1, 2]},
+        "d": 3,
+        "f": [3, 3],
+        "g": {"b": [1, 2], "h": 4},
+    }

@@ -37,7 +37,9 @@ def test_round_trip(tmp_path, name):
         assert (back.grid, back.report) == (GRID, {"method": "fbp", "kernel": "soft"})
     assert torch.equal(back.data, DATA)
     assert (back.grid.shape, back.unit) == (GRID.shape, unit)
-    np.testing.assert_allclose([*back.grid.spacing, *back.grid.center], [*GRID.spacing, *GRID.center], atol=1e-5)
+    np.testing.assert_allclose(
+        [*back.grid.spacing, *back.grid.center], [*GRID.spacing, *GRID.center], atol=1e-5
+    )
 
 
 def nifti(path, affine, unit=None, shape=(5, 4, 3), sform=True):
@@ -50,7 +52,9 @@ def nifti(path, affine, unit=None, shape=(5, 4, 3), sform=True):
     return path
 
 
-@pytest.mark.parametrize(("unit", "mm"), [("micron", 1e-3), ("mm", 1.0), ("meter", 1e3), ("unknown", 1.0), (None, 1.0)])
+@pytest.mark.parametrize(
+    ("unit", "mm"), [("micron", 1e-3), ("mm", 1.0), ("meter", 1e3), ("unknown", 1.0), (None, 1.0)]
+)
 @pytest.mark.parametrize("sform", [True, False])
 def test_nifti_lengths_are_in_its_unit(tmp_path, unit, mm, sform):
     affine = np.diag([-0.05, 0.1, 0.2, 1.0])
@@ -71,7 +75,9 @@ def test_nifti_of_one_volume_with_more_axes(tmp_path):
         more = Volume.load(nifti(tmp_path / "m.nii.gz", np.eye(4), shape=shape))
         assert torch.equal(more.data, plain.data)
         assert more.grid == plain.grid
-    with pytest.raises(ValueError, match=r"shape \(5, 4, 3, 2\), 2 volumes: split them into files of one"):
+    with pytest.raises(
+        ValueError, match=r"shape \(5, 4, 3, 2\), 2 volumes: split them into files of one"
+    ):
         Volume.load(nifti(tmp_path / "t.nii", np.eye(4), shape=(5, 4, 3, 2)))
 
 
@@ -94,13 +100,16 @@ def test_units_of_other_files(tmp_path):
     assert [Volume.load(tmp_path / f"foreign.{end}").unit for end in ("mha", "nii")] == ["HU", "HU"]
     image.SetMetaData("Unit", "Bq/ml")
     SimpleITK.WriteImage(image, str(tmp_path / "pet.mha"))
-    with pytest.raises(ValueError, match="its field Unit gives the unit 'Bq/ml', expected HU or mm"):
+    with pytest.raises(
+        ValueError, match="its field Unit gives the unit 'Bq/ml', expected HU or mm"
+    ):
         Volume.load(tmp_path / "pet.mha")
 
 
 @pytest.mark.parametrize("name", [n for n in NAMES if n != "v.h5"])
 def test_other_software_sees_the_same_place(tmp_path, name):
-    """The point (x, y, z) of the scanner is (−x, −y, z) in ITK, in every format, and holds the same value."""
+    """The point (x, y, z) of the scanner is (−x, −y, z) in ITK, in every format, and holds the
+    same value."""
     Volume(DATA, GRID).save(tmp_path / name)
     image = sitk_read(tmp_path / name)
     for k, j, i in ((0, 0, 0), (3, 1, 4), (2, 5, 0)):
@@ -118,7 +127,8 @@ def test_nifti_has_qform_and_sform(tmp_path):
 
 @pytest.mark.parametrize("name", ["v.nii.gz", "v.mha"])
 def test_a_compressed_file_with_a_wrong_bit_or_a_lost_end_is_refused(tmp_path, name):
-    """Each has a checksum at the end of its voxels; 103 of 200 such .nii.gz were read, by half a million HU off."""
+    """Each has a checksum at the end of its voxels; 103 of 200 such .nii.gz were read, by half a
+    million HU off."""
     rng, path = np.random.default_rng(0), tmp_path / name
     data = torch.from_numpy(rng.integers(-900, 900, GRID_OF_SLICES.shape).astype(np.float32))
     Volume(data, GRID_OF_SLICES).save(path)
@@ -142,7 +152,9 @@ def test_a_2d_image_is_a_volume_of_one_slice_in_every_format(tmp_path, name):
     image.save(tmp_path / name)
     back = Volume.load(tmp_path / name)
     assert torch.equal(back.data, DATA[:1])
-    np.testing.assert_allclose([*back.grid.spacing, *back.grid.center], [0.25, 0.5, 0.25, 0.0, -7.0, 11.0], atol=1e-5)
+    np.testing.assert_allclose(
+        [*back.grid.spacing, *back.grid.center], [0.25, 0.5, 0.25, 0.0, -7.0, 11.0], atol=1e-5
+    )
 
 
 def test_a_single_slice_of_a_series_keeps_its_thickness_and_is_read_as_a_file(tmp_path):
@@ -151,7 +163,9 @@ def test_a_single_slice_of_a_series_keeps_its_thickness_and_is_read_as_a_file(tm
     assert torch.equal(one.data, DATA[1:2])
     np.testing.assert_allclose(one.grid.spacing, GRID.spacing)
     np.testing.assert_allclose(one.grid.center, [GRID.axes[0][1], *GRID.center[1:]], atol=1e-6)
-    with pytest.raises(ValueError, match=r"'0002\.dcm' would be one slice: a DICOM series is a folder"):
+    with pytest.raises(
+        ValueError, match=r"'0002\.dcm' would be one slice: a DICOM series is a folder"
+    ):
         one.save(tmp_path / "0002.dcm")
 
 
@@ -194,7 +208,8 @@ def test_dicom_series_appear_whole_or_not_at_all(tmp_path, monkeypatch):
 
 @pytest.fixture
 def series(tmp_path):
-    """A function that writes a series whose slices a function has changed, and returns its folder."""
+    """A function that writes a series whose slices a function has changed, and returns its
+    folder."""
     Volume(DATA, GRID).save(tmp_path / "plain")
 
     def changed(change, name="s"):
@@ -211,7 +226,9 @@ def series(tmp_path):
     return changed
 
 
-@pytest.mark.parametrize("name", ["1.000000-Full Dose Images-53322", "1.2.840.113619.2.55", "scan.v2", "a.nii.d"])
+@pytest.mark.parametrize(
+    "name", ["1.000000-Full Dose Images-53322", "1.2.840.113619.2.55", "scan.v2", "a.nii.d"]
+)
 def test_dicom_folders_may_have_dots_in_their_names(tmp_path, name):
     (tmp_path / name).mkdir()
     Volume(DATA, GRID).save(tmp_path / name)
@@ -234,8 +251,13 @@ def test_what_archives_leave_beside_slices_is_left_out_and_damaged_slices_are_no
         delattr(report, name)
     report.SOPClassUID = report.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.88.11"
     report.save_as(folder / "report.dcm")
-    for name, content in (("readme.txt", b"hello"), ("LICENSE", b"Creative Commons\r\n"), ("._0001.dcm", b"\0\5"),
-                          ("thumbs.db", bytes(600)), ("picture.png", b"\x89PNG" + bytes(200))):  # fmt: skip
+    for name, content in (
+        ("readme.txt", b"hello"),
+        ("LICENSE", b"Creative Commons\r\n"),
+        ("._0001.dcm", b"\0\5"),
+        ("thumbs.db", bytes(600)),
+        ("picture.png", b"\x89PNG" + bytes(200)),
+    ):
         (folder / name).write_bytes(content)
     (folder / "folder").mkdir()
     assert torch.equal(Volume.load(folder).data, DATA)
@@ -261,7 +283,10 @@ def _pet(d):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda d: setattr(d, "RescaleType", "US"), r"its RescaleType is US \(unspecified\), not HU; .*unit='HU'"),
+        (
+            lambda d: setattr(d, "RescaleType", "US"),
+            r"its RescaleType is US \(unspecified\), not HU; .*unit='HU'",
+        ),
         (lambda d: setattr(d, "RescaleType", "HU_MOD"), "its RescaleType is HU_MOD, not HU"),
         (lambda d: setattr(d, "RescaleType", "Z_EFF"), "its RescaleType is Z_EFF, not HU"),
         (_no_rescale, "it has no RescaleSlope and no RescaleIntercept"),
@@ -313,7 +338,9 @@ def _padded(value, marked, limit=None, vr="SS"):
 )
 def test_padding_about_the_picture_is_air_and_said(series, value, change, inside):
     folder = series(change)
-    with pytest.warns(UserWarning, match=r"of 120 pixels are padding about the picture, .* read as air, -1000 HU"):
+    with pytest.warns(
+        UserWarning, match=r"of 120 pixels are padding about the picture, .* read as air, -1000 HU"
+    ):
         data = Volume.load(folder).data
     expected = DATA.flip(1, 2).clone()
     expected[:, 0], expected[:, 3, 2] = -1000.0, inside
@@ -331,26 +358,34 @@ def test_padding_in_all_corners_that_nothing_marks(series):
 
 
 def test_slices_stand_upright_and_have_what_their_class_demands(tmp_path):
-    """Seen from the feet, anterior up: rows run to the left, columns to the back. Two volumes are two patients."""
+    """Seen from the feet, anterior up: rows run to the left, columns to the back. Two volumes
+    are two patients."""
     for name in ("s", "t"):
         Volume(DATA, GRID).save(tmp_path / name)
     first, other = (pydicom.dcmread(tmp_path / name / "0001.dcm") for name in ("s", "t"))
     assert first.ImageOrientationPatient == [1, 0, 0, 0, 1, 0]
-    np.testing.assert_array_equal(first.pixel_array, DATA[0].flip(0, 1).numpy())  # ours: to the right, to the front
+    # ours: to the right, to the front
+    np.testing.assert_array_equal(first.pixel_array, DATA[0].flip(0, 1).numpy())
     assert (first.PatientPosition, first.BodyPartExamined) == ("HFS", "WHOLEBODY")
     assert re.fullmatch(r"\d{8}", first.StudyDate) is not None
     assert first.PatientID != other.PatientID
     checker = shutil.which("dciodvfy")
     if checker is None:
         pytest.skip("dciodvfy (dicom3tools) is not installed")
-    said = subprocess.run([checker, str(tmp_path / "s" / "0001.dcm")], capture_output=True, text=True, check=False)
+    said = subprocess.run(
+        [checker, str(tmp_path / "s" / "0001.dcm")], capture_output=True, text=True, check=False
+    )
     assert (said.stdout + said.stderr).strip() == "CTImage"
 
 
 def test_dicom_series_are_in_hu_and_whole(tmp_path):
     Volume(DATA, GRID).save(tmp_path / "s")
     first = pydicom.dcmread(tmp_path / "s" / "0001.dcm")
-    assert (first.RescaleType, first.Modality, len(list((tmp_path / "s").iterdir()))) == ("HU", "CT", 4)
+    assert (first.RescaleType, first.Modality, len(list((tmp_path / "s").iterdir()))) == (
+        "HU",
+        "CT",
+        4,
+    )
     with pytest.raises(ValueError, match="is not empty"):
         Volume(DATA, GRID).save(tmp_path / "s")
     with pytest.raises(ValueError, match=r"holds HU, this volume is in mm\^-1"):
@@ -359,7 +394,8 @@ def test_dicom_series_are_in_hu_and_whole(tmp_path):
 
 @pytest.mark.parametrize("flip", [(1, 1, 1), (-1, 1, 1), (1, -1, -1)])
 def test_files_of_other_software_in_any_direction(tmp_path, flip):
-    """A volume written by SimpleITK with flipped axes reads as what SimpleITK itself says of every point."""
+    """A volume written by SimpleITK with flipped axes reads as what SimpleITK itself says of
+    every point."""
     image = SimpleITK.GetImageFromArray(DATA.numpy().astype(np.int16))
     image.SetSpacing((0.25, 0.5, 1.5))
     image.SetOrigin((3.0, -8.0, 20.0))
@@ -384,7 +420,8 @@ def test_a_clinical_slice_reads_as_pydicom_says(tmp_path):
 
 @pytest.mark.parametrize("turned", [(1, 1), (1, -1), (-1, 1), (-1, -1)])
 def test_a_foreign_series_lies_where_others_see_it(tmp_path, turned):
-    """Rows and columns of any direction: every pixel where its position, orientation and spacing put it, as in ITK."""
+    """Rows and columns of any direction: every pixel where its position, orientation and spacing
+    put it, as in ITK."""
     Volume(DATA, GRID).save(tmp_path / "s")
     for k, path in enumerate(sorted((tmp_path / "s").iterdir())):
         d = pydicom.dcmread(path)
@@ -396,7 +433,10 @@ def test_a_foreign_series_lies_where_others_see_it(tmp_path, turned):
     assert sorted(z) == list(z)
     for index in np.ndindex(5, 6, 4):  # column, row, slice
         right, down, up = image.TransformIndexToPhysicalPoint(index)
-        at = [int(np.abs(axis - v).argmin()) for axis, v in zip((z, y, x), (up, -down, -right), strict=True)]
+        at = [
+            int(np.abs(axis - v).argmin())
+            for axis, v in zip((z, y, x), (up, -down, -right), strict=True)
+        ]
         np.testing.assert_allclose([z[at[0]], y[at[1]], x[at[2]]], [up, -down, -right], atol=1e-4)
         assert float(volume.data[tuple(at)]) == float(image[index])
 

@@ -1,4 +1,5 @@
-"""OME-Zarr: what is damaged or lost is refused by name, what earlier versions and other software wrote is read."""
+"""OME-Zarr: what is damaged or lost is refused by name, what earlier versions and other software
+wrote is read."""
 
 import json
 import re
@@ -33,7 +34,9 @@ def test_round_trip(written):
     back = Volume.load(written)
     assert torch.equal(back.data, DATA)
     assert (back.unit, back.grid.shape) == ("mm^-1", GRID.shape)
-    np.testing.assert_allclose([*back.grid.spacing, *back.grid.center], [*GRID.spacing, *GRID.center])
+    np.testing.assert_allclose(
+        [*back.grid.spacing, *back.grid.center], [*GRID.spacing, *GRID.center]
+    )
     assert {path.name for path in (written / "0" / "c").iterdir()} == {"0", "1"}
 
 
@@ -99,18 +102,32 @@ def test_volumes_that_were_written_before_there_were_checksums(tmp_path):
     about = {"ome": {"version": "0.5", "multiscales": [image()]}, "torchpcct": {"unit": "mm^-1"}}
     older(tmp_path / "v.zarr", about)[2:] = 7.0
     back = Volume.load(tmp_path / "v.zarr")
-    assert (back.unit, back.grid.spacing, float(back.data[2, 3, 4])) == ("mm^-1", (2.0, 1.0, 0.5), 7.0)
+    assert (back.unit, back.grid.spacing, float(back.data[2, 3, 4])) == (
+        "mm^-1",
+        (2.0, 1.0, 0.5),
+        7.0,
+    )
     (tmp_path / "v.zarr" / "0" / "c" / "1" / "0" / "0").unlink()
     with pytest.raises(ValueError, match="its chunk 0/c/1/0/0 is lost"):
         Volume.load(tmp_path / "v.zarr")
 
 
 def test_other_software_may_leave_out_chunks_of_the_fill_value(tmp_path):
-    older(tmp_path / "v.zarr", {"ome": {"version": "0.5", "multiscales": [image(unit="micrometer")]}}, fill_value=0.0)
+    older(
+        tmp_path / "v.zarr",
+        {"ome": {"version": "0.5", "multiscales": [image(unit="micrometer")]}},
+        fill_value=0.0,
+    )
     back = Volume.load(tmp_path / "v.zarr")
-    assert (back.unit, float(back.data[2].abs().max()), float(back.data[0, 0, 0])) == ("HU", 0.0, 1.0)
+    assert (back.unit, float(back.data[2].abs().max()), float(back.data[0, 0, 0])) == (
+        "HU",
+        0.0,
+        1.0,
+    )
     np.testing.assert_allclose(back.grid.spacing, (2e-3, 1e-3, 0.5e-3))
-    group = zarr.create_group(tmp_path / "t.zarr", attributes={"ome": {"multiscales": [image("tczyx", lead=2)]}})
+    group = zarr.create_group(
+        tmp_path / "t.zarr", attributes={"ome": {"multiscales": [image("tczyx", lead=2)]}}
+    )
     group.create_array("0", shape=(1, 1, 3, 4, 5), dtype="int16")[...] = 9
     assert Volume.load(tmp_path / "t.zarr").data.shape == (3, 4, 5)
 

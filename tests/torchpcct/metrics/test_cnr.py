@@ -27,13 +27,16 @@ def test_sd_interval_matches_the_known_factors():
 
 @pytest.mark.parametrize(("n", "rho"), [(5, 0.0), (10, 0.0), (10, 0.7), (50, -0.5)])
 def test_interval_coverage(n, rho):
-    """Nominally 95 %; of 6000 experiments with n = 5 and independent means it was 92.8 %, as the docstring says."""
+    """Nominally 95 %; of 6000 experiments with n = 5 and independent means it was 92.8 %, as the
+    docstring says."""
     rng = np.random.default_rng(8)
     sd_fg, sd_bg = 10.0, 20.0
     truth = 50 / np.hypot(sd_fg, sd_bg)
     cov = [[sd_fg**2, rho * sd_fg * sd_bg], [rho * sd_fg * sd_bg, sd_bg**2]]
     covered = 0
-    for seed, (fg, bg) in enumerate(rng.multivariate_normal([40, 90], cov, (600, n)).swapaxes(1, 2)):
+    for seed, (fg, bg) in enumerate(
+        rng.multivariate_normal([40, 90], cov, (600, n)).swapaxes(1, 2)
+    ):
         low, high = cnr_interval(fg, bg, draws=1000, seed=seed)
         covered += low <= truth <= high
     assert 0.90 <= covered / 600 <= 0.98  # a percentile bootstrap of 10 pairs covers 0.82

@@ -1,4 +1,5 @@
-"""Control variates: least squares by another way, the coverage of the intervals, and what is refused."""
+"""Control variates: least squares by another way, the coverage of the intervals, and what is
+refused."""
 
 import math
 
@@ -54,8 +55,12 @@ def test_closed_forms_are_refits():
 
 
 def test_variance_is_unbiased():
-    """Mean over 1500 experiments of 12 draws, where the correction for the error of β is 7 % of the variance."""
-    found = [math.exp(controlled_log_variance(*draws(12, 0.8, seed=s)[:2], SIGMA).value) for s in range(1500)]
+    """Mean over 1500 experiments of 12 draws, where the correction for the error of β is 7 % of
+    the variance."""
+    found = [
+        math.exp(controlled_log_variance(*draws(12, 0.8, seed=s)[:2], SIGMA).value)
+        for s in range(1500)
+    ]
     true = draws(12, 0.8)[2]
     assert np.mean(found) == pytest.approx(true, abs=3.5 * np.std(found) / math.sqrt(1500))
     assert np.std(found) / math.sqrt(1500) < 0.015 * true
@@ -81,8 +86,11 @@ def test_a_linear_method_is_exact():
 
 @pytest.mark.parametrize(("correlation", "width"), [(0.0, 1.217), (0.97, 1.069), (0.999, 1.0125)])
 def test_half_width_of_a_factor(correlation, width):
-    """×1.22, ×1.07, ×1.01 at n = 200, as exp(z √(2 (1 − R⁴) / n)); the intervals of simulated experiments have it."""
-    assert math.exp(1.96 * math.sqrt(2.0 * (1.0 - correlation**4) / 200)) == pytest.approx(width, abs=1e-3)
+    """×1.22, ×1.07, ×1.01 at n = 200, as exp(z √(2 (1 − R⁴) / n)); the intervals of simulated
+    experiments have it."""
+    assert math.exp(1.96 * math.sqrt(2.0 * (1.0 - correlation**4) / 200)) == pytest.approx(
+        width, abs=1e-3
+    )
     found = []
     for s in range(60):
         y, x, _ = draws(200, correlation or 0.97, seed=s)
@@ -98,15 +106,21 @@ def paper_cnr(y, z, x):
 
 
 @pytest.mark.parametrize(
-    ("experiments", "low", "high"), [(150, 0.89, 1.0), pytest.param(1000, 0.93, 0.97, marks=pytest.mark.slow)]
+    ("experiments", "low", "high"),
+    [(150, 0.89, 1.0), pytest.param(1000, 0.93, 0.97, marks=pytest.mark.slow)],
 )
 @pytest.mark.parametrize("kind", ["normal", "tails", "bent"])
 def test_coverage(kind, experiments, low, high):
-    """Of experiments of 200 draws: variance, mean and CNR within 93–97 % (binomial error of 1000: 0.7 %)."""
+    """Of experiments of 200 draws: variance, mean and CNR within 93–97 % (binomial error of
+    1000: 0.7 %)."""
     hits = np.zeros(3)
     for s in range(experiments):
         y, x, true = draws(200, 0.97, kind, seed=s)
-        z = 9.0 + (x - MU) @ [0.1, 0.7] + np.random.default_rng(10_000 + s).standard_normal(200) * 0.2
+        z = (
+            9.0
+            + (x - MU) @ [0.1, 0.7]
+            + np.random.default_rng(10_000 + s).standard_normal(200) * 0.2
+        )
         true_z = np.array([0.1, 0.7]) @ SIGMA @ [0.1, 0.7] + 0.04
         figures = (
             (controlled_log_variance(y, x, SIGMA).exponential(), true),
@@ -119,7 +133,8 @@ def test_coverage(kind, experiments, low, high):
 
 
 def test_pairs_of_methods():
-    """A factor of two methods of the same draws: what they share cancels, and the interval says so."""
+    """A factor of two methods of the same draws: what they share cancels, and the interval says
+    so."""
     y, _, _ = draws(200, 0.9)
     first, second = controlled_log_variance(y, None), controlled_log_variance(2.0 * y + 1.0, None)
     assert combined(np.subtract, second, first).exponential() == pytest.approx((4.0, 4.0, 4.0))
@@ -132,9 +147,13 @@ def test_combined_and_sums():
     parts = np.square(y - y.mean())
     log = log_of_sum(parts, lost=1)
     assert log.value == pytest.approx(math.log(y.var(ddof=1)))
-    np.testing.assert_allclose(log.left_out, [math.log(np.delete(y, k).var(ddof=1)) for k in range(20)])
+    np.testing.assert_allclose(
+        log.left_out, [math.log(np.delete(y, k).var(ddof=1)) for k in range(20)]
+    )
     mean = log_of_sum(np.square(y))
-    np.testing.assert_allclose(mean.left_out, [math.log(np.square(np.delete(y, k)).mean()) for k in range(20)])
+    np.testing.assert_allclose(
+        mean.left_out, [math.log(np.square(np.delete(y, k)).mean()) for k in range(20)]
+    )
     assert combined(np.subtract, log, log).estimate() == pytest.approx((0, 0, 0))
     half = log.exponential(scale=-0.5)
     assert half.low < half.value < half.high
@@ -151,5 +170,8 @@ def test_refusals():
         (r"\(2, 2\)", lambda: controlled_log_variance(y, x, 1.0)),
         ("no covariance", lambda: controlled_log_variance(y, x, [[1.0, 2.0], [2.0, 1.0]])),
         ("do not vary", lambda: controlled_log_variance(np.ones(20), None)),
-        ("same realisations", lambda: combined(np.subtract, Jackknifed(1.0, y), Jackknifed(1.0, y[:5]))),
+        (
+            "same realisations",
+            lambda: combined(np.subtract, Jackknifed(1.0, y), Jackknifed(1.0, y[:5])),
+        ),
     )

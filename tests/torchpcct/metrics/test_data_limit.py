@@ -38,10 +38,13 @@ def test_information_against_dense_algebra(kind, monkeypatch):
 def test_limit_is_the_pseudo_inverse_of_the_weighted_system():
     maps, weight = system(1)
     root = np.sqrt(weight.ravel())[:, None] * maps.reshape(4, -1).T
-    estimator = np.linalg.pinv(root)  # its rows are the least-squares weights of unit-variance readings
+    # its rows are the least-squares weights of unit-variance readings
+    estimator = np.linalg.pinv(root)
     h = np.array([[1, -1, 0, 0], [0, 0.3, 0.7, 0]])
     f = information_matrix(maps, weight)
-    np.testing.assert_allclose(ceiling(f, np.eye(4)), estimator @ estimator.T, rtol=1e-10, atol=1e-14)
+    np.testing.assert_allclose(
+        ceiling(f, np.eye(4)), estimator @ estimator.T, rtol=1e-10, atol=1e-14
+    )
     np.testing.assert_allclose(ceiling(f, h), h @ estimator @ estimator.T @ h.T, rtol=1e-10)
     assert ceiling(f, h[0]) == pytest.approx(ceiling(f, h)[:1, :1])
 
@@ -74,7 +77,10 @@ test_refusals = refusals(
     ("NaN", lambda: information_matrix(MAPS, WEIGHT * np.nan)),
     ("scale", lambda: information_matrix(MAPS, WEIGHT, scale=0)),
     ("tissue 1", lambda: ceiling(np.diag([1.0, 0]), [1, 0])),
-    ("tell the tissues apart", lambda: ceiling(information_matrix([MAPS[0], 2 * MAPS[0]], WEIGHT), [1, 0])),
+    (
+        "tell the tissues apart",
+        lambda: ceiling(information_matrix([MAPS[0], 2 * MAPS[0]], WEIGHT), [1, 0]),
+    ),
     ("square", lambda: ceiling(INFORMATION[:2], [1, 0])),
     ("symmetric", lambda: ceiling(INFORMATION + np.triu(INFORMATION, 1), [1, 0, 0, 0])),
     ("functionals", lambda: ceiling(INFORMATION, [1, 0])),

@@ -1,4 +1,5 @@
-"""Noise at equal resolution: what a filter of the reference saves is nothing, whatever its directions and the noise."""
+"""Noise at equal resolution: what a filter of the reference saves is nothing, whatever its
+directions and the noise."""
 
 import numpy as np
 import pytest
@@ -8,7 +9,8 @@ from scipy import ndimage
 from torchpcct.metrics.equal_resolution import noise_at_equal_resolution
 from torchpcct.metrics.half_split import HalfSplit
 
-SHAPE, SPACING = (20, 40, 40), (0.4, 0.3, 0.3)
+SHAPE = (20, 40, 40)
+SPACING = (0.4, 0.3, 0.3)
 
 
 def drawn(kind, draw, shape=SHAPE):
@@ -42,7 +44,11 @@ def scans(object_, kind, noise=0.7):
     return [object_ + noise * drawn(kind, draw, object_.shape) for _ in range(2)]
 
 
-WIDTHS = {"isotropic": [(0.5,) * 3, (1.0,) * 3, (2.0,) * 3], "plane": [(0, 1, 1), (0, 2, 2)], "axial": [(1.5, 0, 0)]}
+WIDTHS = {
+    "isotropic": [(0.5,) * 3, (1.0,) * 3, (2.0,) * 3],
+    "plane": [(0, 1, 1), (0, 2, 2)],
+    "axial": [(1.5, 0, 0)],
+}
 
 
 @pytest.mark.parametrize("kind", ["white", "ramp", "soft"])
@@ -70,19 +76,24 @@ def continued(volume, width):
     return np.fft.ifftn(np.fft.fftn(volume) * gauss).real
 
 
-@pytest.mark.parametrize("method", [lambda v: ndimage.gaussian_filter(v, 1.0, mode="nearest"),
-                                    lambda v: continued(v, 1.0)])  # fmt: skip
+@pytest.mark.parametrize(
+    "method",
+    [lambda v: ndimage.gaussian_filter(v, 1.0, mode="nearest"), lambda v: continued(v, 1.0)],
+)
 def test_borders_widen_the_interval(balls, method):
     """A filter that continues the volume in another way still saves nothing."""
     reference = scans(balls, "ramp")
-    found = noise_at_equal_resolution(pair(*map(method, reference)), pair(*reference), SPACING).dose_factor
+    found = noise_at_equal_resolution(
+        pair(*map(method, reference)), pair(*reference), SPACING
+    ).dose_factor
     assert found.low < 1.0 < found.high
     assert found.value == pytest.approx(1.0, abs=0.15)
 
 
 @pytest.mark.parametrize("kind", ["white", "ramp"])
 def test_half_the_noise_is_four_times_the_dose(balls, kind):
-    """A method that knows how to halve the noise of a blur, not the object; twice as much noise costs four times."""
+    """A method that knows how to halve the noise of a blur, not the object; twice as much noise
+    costs four times."""
     reference = scans(balls, kind)
     for share in (0.5, 2.0):
         volumes = [ndimage.gaussian_filter(balls + share * (v - balls), 1.0) for v in reference]
@@ -120,7 +131,9 @@ def test_a_region_counts_alone():
 def test_nothing_can_be_said_of_noise_alone():
     draw = np.random.default_rng(2)
     noise = [draw.normal(size=SHAPE) for _ in range(2)]
-    found = noise_at_equal_resolution(pair(*(ndimage.gaussian_filter(v, 1) for v in noise)), pair(*noise), SPACING)
+    found = noise_at_equal_resolution(
+        pair(*(ndimage.gaussian_filter(v, 1) for v in noise)), pair(*noise), SPACING
+    )
     assert "nothing in common" in found.why
     assert np.isnan(found.dose_factor.value)
 
@@ -138,4 +151,6 @@ def test_volumes_that_say_nothing_are_refused(balls, method, said):
     with pytest.raises(ValueError, match=said):
         noise_at_equal_resolution(method(reference), pair(*reference), SPACING)
     with pytest.raises(ValueError, match="two voxels"):
-        noise_at_equal_resolution(pair(*reference), pair(*reference), SPACING, np.zeros(SHAPE, bool))
+        noise_at_equal_resolution(
+            pair(*reference), pair(*reference), SPACING, np.zeros(SHAPE, bool)
+        )

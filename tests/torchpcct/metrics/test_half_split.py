@@ -45,7 +45,9 @@ def test_the_resolution_is_where_signal_and_noise_cross():
     generator = torch.Generator().manual_seed(0)
     radius = np.hypot(np.fft.fftfreq(128)[:, None], np.fft.fftfreq(128))
     low = torch.from_numpy(radius < 0.2)
-    signal = torch.fft.ifft2(torch.fft.fft2(torch.randn(4, 128, 128, generator=generator).double()) * low).real
+    signal = torch.fft.ifft2(
+        torch.fft.fft2(torch.randn(4, 128, 128, generator=generator).double()) * low
+    ).real
     pair = [signal + 0.1 * torch.randn(4, 128, 128, generator=generator).double() for _ in range(2)]
     assert HalfSplit(*pair).resolution(0.5) == pytest.approx(0.2 / 0.5, rel=0.05)
     noise = [torch.randn(4, 128, 128, generator=generator) for _ in range(2)]
@@ -53,7 +55,8 @@ def test_the_resolution_is_where_signal_and_noise_cross():
 
 
 def test_the_transfer_is_the_blur_whatever_the_noise():
-    """A Gaussian known in advance, and a method that blurs the signal but not its noise; noise power drops out."""
+    """A Gaussian known in advance, and a method that blurs the signal but not its noise; noise
+    power drops out."""
     generator = torch.Generator().manual_seed(1)
     square = np.fft.fftfreq(96)[:, None] ** 2 + np.fft.fftfreq(96) ** 2
     gauss = torch.from_numpy(0.5 ** (square / 0.12**2))

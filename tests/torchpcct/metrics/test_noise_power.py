@@ -14,14 +14,20 @@ from torchpcct.metrics import noise_power_spectrum
 
 def coloured(shape, spacing, sigma, n, seed, sd=10.0):
     """White noise of ``sd`` HU filtered by a Gaussian of ``sigma`` mm, and its exact NPS."""
-    f = np.meshgrid(*(np.fft.fftfreq(k, s) for k, s in zip(shape, spacing, strict=True)), indexing="ij")
+    f = np.meshgrid(
+        *(np.fft.fftfreq(k, s) for k, s in zip(shape, spacing, strict=True)), indexing="ij"
+    )
     gain = np.exp(-2 * (math.pi * sigma) ** 2 * sum(np.square(a) for a in f))
     noise = sd * np.random.default_rng(seed).standard_normal((n, *shape))
     axes = tuple(range(1, noise.ndim))
-    return np.fft.ifftn(np.fft.fftn(noise, axes=axes) * gain, axes=axes).real, sd**2 * math.prod(spacing) * gain**2
+    return np.fft.ifftn(np.fft.fftn(noise, axes=axes) * gain, axes=axes).real, sd**2 * math.prod(
+        spacing
+    ) * gain**2
 
 
-@pytest.mark.parametrize(("shape", "spacing"), [((24, 30), (0.3, 0.2)), ((8, 12, 10), (0.4, 0.25, 0.2))])
+@pytest.mark.parametrize(
+    ("shape", "spacing"), [((24, 30), (0.3, 0.2)), ((8, 12, 10), (0.4, 0.25, 0.2))]
+)
 def test_filtered_white_noise(shape, spacing):
     realizations, exact = coloured(shape, spacing, 0.25, 400, 1)
     object_ = np.linspace(-500, 500, math.prod(shape)).reshape(shape)

@@ -24,7 +24,8 @@ def pairs(n, channels=4, seed=0, correlation=0.0, separation=0.8):
     difference = separation * np.linspace(1, 0.2, channels)
     common = rng.standard_normal((n, channels))
     a, b = (
-        math.sqrt(correlation) * common + math.sqrt(1 - correlation) * rng.standard_normal((n, channels))
+        math.sqrt(correlation) * common
+        + math.sqrt(1 - correlation) * rng.standard_normal((n, channels))
         for _ in range(2)
     )
     ideal = math.sqrt(difference @ np.linalg.solve(root @ root.T, difference))
@@ -56,7 +57,9 @@ def test_an_observer_without_signal_guesses():
     for seed in range(20):
         present, absent, _, _ = pairs(30, 10, seed=seed, separation=0.0)
         honest.append(d_prime(*hotelling_scores(present, absent)).value)
-        trained_on_all = np.linalg.solve(np.cov(present.T) + np.cov(absent.T), present.mean(0) - absent.mean(0))
+        trained_on_all = np.linalg.solve(
+            np.cov(present.T) + np.cov(absent.T), present.mean(0) - absent.mean(0)
+        )
         deceived.append(d_prime(present @ trained_on_all, absent @ trained_on_all).value)
     assert abs(np.mean(honest)) < 0.3
     assert np.mean(deceived) > 0.8
@@ -65,7 +68,11 @@ def test_an_observer_without_signal_guesses():
 def test_units_of_the_channels_do_not_matter():
     present, absent, _, _ = pairs(50, seed=4)
     units = np.array([1e-6, 1.0, 1e3, 1e7])
-    for s, t in zip(hotelling_scores(present, absent), hotelling_scores(present * units, absent * units), strict=True):
+    for s, t in zip(
+        hotelling_scores(present, absent),
+        hotelling_scores(present * units, absent * units),
+        strict=True,
+    ):
         np.testing.assert_allclose(s, t, rtol=1e-6, atol=1e-9)
 
 
@@ -78,13 +85,21 @@ def test_d_prime_interval_coverage():
     assert 0.90 <= covered / 200 <= 0.985
 
 
-@pytest.mark.parametrize("grid", [VolumeGrid((64, 80), 0.25), VolumeGrid((24, 28, 32), (0.3, 0.25, 0.2))])
+@pytest.mark.parametrize(
+    "grid", [VolumeGrid((64, 80), 0.25), VolumeGrid((24, 28, 32), (0.3, 0.25, 0.2))]
+)
 def test_channels_have_their_spectrum(grid):
-    """In the frequency domain a channel is the difference of two Gaussians, at any spacing, place and dimension."""
+    """In the frequency domain a channel is the difference of two Gaussians, at any spacing,
+    place and dimension."""
     center = tuple(0.3 * s for s in grid.spacing)
     channels = dog_channels(grid, center, count=2, lowest=0.2)
     np.testing.assert_allclose(np.square(channels).sum(tuple(range(1, channels.ndim))), 1)
-    f = np.sqrt(sum(np.square(a) for a in np.meshgrid(*map(np.fft.fftfreq, grid.shape, grid.spacing), indexing="ij")))
+    f = np.sqrt(
+        sum(
+            np.square(a)
+            for a in np.meshgrid(*map(np.fft.fftfreq, grid.shape, grid.spacing), indexing="ij")
+        )
+    )
     for k, channel in enumerate(channels):
         s = 0.2 * 1.4**k
         expected = np.exp(-0.5 * (f / (1.67 * s)) ** 2) - np.exp(-0.5 * (f / s) ** 2)
@@ -104,7 +119,8 @@ def test_channels_follow_the_core():
 
 
 def test_observer_on_images():
-    """White noise and a known blob: with the blob as a channel the observer is the matched filter, d′ = |s| / σ."""
+    """White noise and a known blob: with the blob as a channel the observer is the matched
+    filter, d′ = |s| / σ."""
     grid = VolumeGrid((16, 16), 0.5)
     y, x = np.meshgrid(*grid.axes, indexing="ij")
     blob = -60 * np.exp(-(x**2 + y**2) / 2)
@@ -119,7 +135,9 @@ def test_observer_on_images():
 def test_responses_are_inner_products():
     images, channels = np.random.default_rng(7).standard_normal((2, 3, 4, 5))
     expected = np.einsum("nij,cij->nc", images, channels)
-    np.testing.assert_allclose(channel_responses(torch.from_numpy(images), channels), expected, rtol=1e-12)
+    np.testing.assert_allclose(
+        channel_responses(torch.from_numpy(images), channels), expected, rtol=1e-12
+    )
 
 
 PRESENT, ABSENT, _, _ = pairs(20)

@@ -1,4 +1,5 @@
-"""Lumen, core and cap by contours and by thresholds, against drawn shapes whose measures are known."""
+"""Lumen, core and cap by contours and by thresholds, against drawn shapes whose measures are
+known."""
 
 import math
 
@@ -28,16 +29,22 @@ def distance(center: tuple[float, float], grid: VolumeGrid = GRID) -> np.ndarray
     return np.hypot(y - center[0], x - center[1])
 
 
-def edge(center: tuple[float, float], radius: float, grid: VolumeGrid = GRID, width: float = 0.08) -> np.ndarray:
+def edge(
+    center: tuple[float, float], radius: float, grid: VolumeGrid = GRID, width: float = 0.08
+) -> np.ndarray:
     """1 inside a disc, 0 outside, with a linear edge whose middle lies on the circle."""
     return np.clip(0.5 - (distance(center, grid) - radius) / width, 0.0, 1.0)
 
 
 def vessel(
-    lumen: float = 0.8, core: float = 0.35, cap: float = 0.2, angle: float = 0.0, grid: VolumeGrid = GRID
+    lumen: float = 0.8,
+    core: float = 0.35,
+    cap: float = 0.2,
+    angle: float = 0.0,
+    grid: VolumeGrid = GRID,
 ) -> tuple[np.ndarray, tuple[float, float], tuple[float, float]]:
-    """Fat, fibrous tissue (90 HU), blood (410) and beside it a core (30), with the thresholds halfway between; and the
-    centres of the two."""
+    """Fat, fibrous tissue (90 HU), blood (410) and beside it a core (30), with the thresholds
+    halfway between; and the centres of the two."""
     a = (-30.0 - 0.35 * math.sin(angle), -29.0 - 0.35 * math.cos(angle))
     away = lumen + cap + core
     b = (a[0] + away * math.sin(angle), a[1] + away * math.cos(angle))
@@ -47,13 +54,18 @@ def vessel(
 
 @settings(max_examples=10, deadline=None)
 @given(
-    lumen=st.floats(0.4, 0.85), core=st.floats(0.2, 0.4), cap=st.floats(0.1, 0.25), angle=st.floats(-math.pi, math.pi)
+    lumen=st.floats(0.4, 0.85),
+    core=st.floats(0.2, 0.4),
+    cap=st.floats(0.1, 0.25),
+    angle=st.floats(-math.pi, math.pi),
 )
 def test_discs(lumen, core, cap, angle):
     image, a, b = vessel(lumen, core, cap, angle)
     found = segment_plaque(image, GRID)
     # Counting pixels errs by a fraction of those on the rim.
-    assert found.lumen_area == pytest.approx(math.pi * lumen**2, abs=0.15 * 2 * math.pi * lumen * 0.03)
+    assert found.lumen_area == pytest.approx(
+        math.pi * lumen**2, abs=0.15 * 2 * math.pi * lumen * 0.03
+    )
     assert found.core_area == pytest.approx(math.pi * core**2, abs=0.2 * 2 * math.pi * core * 0.03)
     assert found.cap_thickness == pytest.approx(cap, abs=0.004)
     assert cap_on_line(image, GRID, a, b) == pytest.approx(cap, abs=0.003)
@@ -168,7 +180,10 @@ def test_dice():
 
 test_refusals = refusals(
     ("one slice of the grid's shape", lambda: segment_plaque(np.zeros((3, 3)), GRID)),
-    ("sample the axial image", lambda: segment_plaque(np.zeros((2, 3, 3)), VolumeGrid((2, 3, 3), 1.0))),
+    (
+        "sample the axial image",
+        lambda: segment_plaque(np.zeros((2, 3, 3)), VolumeGrid((2, 3, 3), 1.0)),
+    ),
     ("NaN", lambda: segment_plaque(np.full(GRID.shape, np.nan), GRID)),
     ("leaves the image", lambda: cap_on_line(np.zeros(GRID.shape), GRID, (-30, -29), (-30, -9))),
     ("apart", lambda: cap_on_line(np.zeros(GRID.shape), GRID, (-30, -29), (-30, -29))),

@@ -14,7 +14,9 @@ from torchpcct.metrics.residual_test import _upper_tail, residual_test
 SHAPE = (60, 6, 24)
 W = torch.linspace(500.0, 1500.0, math.prod(SHAPE), dtype=torch.float64).reshape(SHAPE)
 U = torch.arange(24, dtype=torch.float64) - 11.5
-LINES = 0.1 * torch.exp(-((U - 4.0 * torch.sin(torch.linspace(0, 6.2, 60))[:, None, None]) ** 2) / 8).expand(SHAPE)
+LINES = 0.1 * torch.exp(
+    -((U - 4.0 * torch.sin(torch.linspace(0, 6.2, 60))[:, None, None]) ** 2) / 8
+).expand(SHAPE)
 
 
 def noise(seed):
@@ -23,8 +25,11 @@ def noise(seed):
 
 
 def shifted(columns):
-    """LINES of a detector that is moved by so many columns, less LINES: what a wrong centre leaves."""
-    moved = 0.1 * torch.exp(-((U - columns - 4.0 * torch.sin(torch.linspace(0, 6.2, 60))[:, None, None]) ** 2) / 8)
+    """LINES of a detector that is moved by so many columns, less LINES: what a wrong centre
+    leaves."""
+    moved = 0.1 * torch.exp(
+        -((U - columns - 4.0 * torch.sin(torch.linspace(0, 6.2, 60))[:, None, None]) ** 2) / 8
+    )
     return moved.expand(SHAPE) - LINES
 
 
@@ -46,7 +51,9 @@ def test_a_quarter_of_a_column_is_found_and_measured():
     # Of the shift the score's standard error is 1 / √⟨t, W t⟩.
     t = torch.zeros(SHAPE, dtype=torch.float64)
     t[..., 1:-1] = (LINES[..., 2:] - LINES[..., :-2]) / 2
-    assert found.sizes["centre"] == pytest.approx(0.25, abs=0.01 + 4 / math.sqrt(float((W * t * t).sum())))
+    assert found.sizes["centre"] == pytest.approx(
+        0.25, abs=0.01 + 4 / math.sqrt(float((W * t * t).sum()))
+    )
     assert abs(found.chi2 - 1) < 0.1  # χ² alone does not see it
 
 
@@ -54,7 +61,10 @@ def test_a_quarter_of_a_column_is_found_and_measured():
     ("change", "match"),
     [
         (torch.linspace(0, 0.01, 60)[:, None, None], "readings of some views"),
-        (0.005 * torch.randn(60, 1, 1, generator=torch.Generator().manual_seed(5)), "readings of some views"),
+        (
+            0.005 * torch.randn(60, 1, 1, generator=torch.Generator().manual_seed(5)),
+            "readings of some views",
+        ),
         (torch.tensor([0.0, 0, 0.01, 0, 0, 0])[:, None], "readings of some rows"),
     ],
 )
@@ -85,7 +95,9 @@ def test_a_wrong_noise_level_is_found():
     assert "stated noise variance" in residual_test(1.1 * noise(3), W, LINES).findings[0]
     assert "stated noise variance" in residual_test(0.9 * noise(3), W, LINES).findings[0]
     # A tenth of the readings were fitted: χ² of 0.9 is what must be.
-    assert residual_test(math.sqrt(0.9) * noise(3), W, LINES, unknowns=W.numel() // 10).findings == ()
+    assert (
+        residual_test(math.sqrt(0.9) * noise(3), W, LINES, unknowns=W.numel() // 10).findings == ()
+    )
 
 
 def test_readings_without_weight_do_not_count():
@@ -115,11 +127,22 @@ def test_bad_input_is_named():
 @pytest.mark.parametrize("degrees", [1, 2, 37, 10**5])
 @pytest.mark.parametrize("noncentrality", [0.0, 1e-30, 1.0, 576.0, 9.9e4, 1e6, 1e15])
 def test_tails_of_any_size_are_probabilities_that_fall(degrees, noncentrality):
-    """Also where SciPy's own function overflows: far below a large mean, and where it takes seconds."""
+    """Also where SciPy's own function overflows: far below a large mean, and where it takes
+    seconds."""
     mean = degrees + noncentrality
     sd = math.sqrt(2 * (degrees + 2 * noncentrality))
     at = sorted(
-        {0.0, 1e-300, mean / 100, max(mean - 4 * sd, 0.0), mean, mean + 3 * sd, mean + 60 * sd, 1e300, math.inf}
+        {
+            0.0,
+            1e-300,
+            mean / 100,
+            max(mean - 4 * sd, 0.0),
+            mean,
+            mean + 3 * sd,
+            mean + 60 * sd,
+            1e300,
+            math.inf,
+        }
     )
     tails = [_upper_tail(x, degrees, noncentrality) for x in at]
     assert all(0.0 <= p <= 1.0 for p in tails)
@@ -132,9 +155,13 @@ def test_tails_of_any_size_are_probabilities_that_fall(degrees, noncentrality):
 
 
 def test_a_single_row_that_fits_exactly():
-    """Its gain is fitted to rounding by a volume that has converged; the non-central χ² is then asked far below 1."""
+    """Its gain is fitted to rounding by a volume that has converged; the non-central χ² is then
+    asked far below 1."""
     w = torch.full((120, 1, 160), 3e4, dtype=torch.float64)
-    r = torch.randn(w.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64) / w.sqrt()
+    r = (
+        torch.randn(w.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        / w.sqrt()
+    )
     found = residual_test(r - r.mean(), w, torch.ones_like(r).cumsum(-1) / 100)
     assert found.findings == ()
     assert found.p_values["rows"] == 1.0

@@ -32,7 +32,9 @@ def test_gaussian_disk(sigma, contrast):
     np.testing.assert_allclose(edge.values[use], expected[use], atol=0.01)
     assert edge.values[0] == pytest.approx(1)
     assert edge.f50 == pytest.approx(math.sqrt(math.log(2) / 2) / (math.pi * sigma), rel=0.01)
-    assert edge.frequency(0.1) == pytest.approx(math.sqrt(math.log(10) / 2) / (math.pi * sigma), rel=0.02)
+    assert edge.frequency(0.1) == pytest.approx(
+        math.sqrt(math.log(10) / 2) / (math.pi * sigma), rel=0.02
+    )
 
 
 def test_bins_do_not_blur():
@@ -68,7 +70,8 @@ def faint():
 
 @pytest.mark.parametrize("correlated", [0.0, 1.0])
 def test_noise_has_no_resolution(faint, correlated):
-    """An edge that is not there, or as faint as the noise, is refused; what is not refused is near the truth."""
+    """An edge that is not there, or as faint as the noise, is refused; what is not refused is
+    near the truth."""
     disc, distance = faint
     true = task_transfer(disc, distance, (2.0, 2.0), 0.125).f50
     for seed in range(6):
@@ -79,4 +82,6 @@ def test_noise_has_no_resolution(faint, correlated):
             task_transfer(60.0 * noise, distance, (2.0, 2.0), 0.125)
         with pytest.raises(ValueError, match="noise"):
             task_transfer(disc + 60.0 * noise, distance, (2.0, 2.0), 0.125)
-        assert task_transfer(disc + 3.0 * noise, distance, (2.0, 2.0), 0.125).f50 == pytest.approx(true, rel=0.15)
+        assert task_transfer(disc + 3.0 * noise, distance, (2.0, 2.0), 0.125).f50 == pytest.approx(
+            true, rel=0.15
+        )

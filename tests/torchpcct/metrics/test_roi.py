@@ -20,14 +20,18 @@ def test_interpolation_is_exact_for_affine_volumes():
     image = axial_grid((0.0, -30.38, -29.63))
     inner = VolumeGrid((1, 200, 200), 0.035, image.center)
     expected = affine_volume(inner, coefficients)
-    torch.testing.assert_close(sample_axial(affine_volume(GRID, coefficients), GRID, inner), expected)
+    torch.testing.assert_close(
+        sample_axial(affine_volume(GRID, coefficients), GRID, inner), expected
+    )
 
 
 def test_roi_mean_is_the_mean_of_the_interpolated_image():
     image = axial_grid((0.0, -30.38, -29.63))
     mask = np.zeros(image.shape, bool)
     mask[0, 100:140, 90:170] = np.random.default_rng(0).random((40, 80)) > 0.5
-    volume = torch.randn(3, *GRID.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    volume = torch.randn(
+        3, *GRID.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     roi = RoiMean(GRID, image, mask)
     direct = sample_axial(volume, GRID, image)[:, torch.from_numpy(mask)].mean(-1)
     torch.testing.assert_close(roi(volume), direct)

@@ -1,4 +1,5 @@
-"""The projector, of grids at rest and moving ones, against exact line integrals, and those against closed forms."""
+"""The projector, of grids at rest and moving ones, against exact line integrals, and those
+against closed forms."""
 
 import math
 
@@ -24,14 +25,26 @@ def _error(geometry, grid, bodies, window=None, sub=1, dtype=torch.float64):
 
 
 def test_the_exact_line_integrals_are_closed_forms():
-    """A disc's diameter, both axes of a turned ellipse, a Gaussian's mass, a sphere off the middle plane."""
-    disc = line_integrals(ParallelBeam([0.0, 1.0, 2.5], 3, 1e-6), [Ellipsoid((0.0, 0.0), 7.0, value=2.0)])
+    """A disc's diameter, both axes of a turned ellipse, a Gaussian's mass, a sphere off the
+    middle plane."""
+    disc = line_integrals(
+        ParallelBeam([0.0, 1.0, 2.5], 3, 1e-6), [Ellipsoid((0.0, 0.0), 7.0, value=2.0)]
+    )
     assert disc == pytest.approx(28.0)
     across = FanBeam([0.3, 0.3 + math.pi / 2], 100.0, 200.0, 1, 1e-6)
-    assert line_integrals(across, [Ellipsoid((0.0, 0.0), (2.0, 5.0), angle=0.3)])[:, 0] == pytest.approx([10.0, 4.0])
-    mass = line_integrals(ParallelBeam([0.2], 400, 0.1), [Gaussian((1.0, -2.0), (1.5, 2.5), 0.7, 3.0)]).sum() * 0.1
+    assert line_integrals(across, [Ellipsoid((0.0, 0.0), (2.0, 5.0), angle=0.3)])[
+        :, 0
+    ] == pytest.approx([10.0, 4.0])
+    mass = (
+        line_integrals(
+            ParallelBeam([0.2], 400, 0.1), [Gaussian((1.0, -2.0), (1.5, 2.5), 0.7, 3.0)]
+        ).sum()
+        * 0.1
+    )
     assert mass == pytest.approx(3.0 * 2 * math.pi * 1.5 * 2.5, rel=1e-9)
-    sphere = line_integrals(ConeBeam([0.0], 100.0, 200.0, 1, 1, 1e-6, (30.0, 0.0)), [Ellipsoid((0.0, 0.0, 0.0), 20.0)])
+    sphere = line_integrals(
+        ConeBeam([0.0], 100.0, 200.0, 1, 1, 1e-6, (30.0, 0.0)), [Ellipsoid((0.0, 0.0, 0.0), 20.0)]
+    )
     distance = 100.0 * math.sin(math.atan(30.0 / 200.0))
     assert sphere[0, 0, 0] == pytest.approx(2 * math.sqrt(20.0**2 - distance**2))
 
@@ -52,14 +65,27 @@ def test_gaussians_in_any_fan_beam(start, sod, ratio, offset, curved, cy, cx, sp
     geometry = FanBeam(full_turn(7, start), sod, sod * ratio, 120, 0.9 * ratio, offset, detector)
     grid = VolumeGrid((64, 60), (1.0, spacing), (cy, cx))
     body = Gaussian((cy + 1.3, cx - 2.1), (4.0, 5.5), 0.4, 0.02)
-    assert _error(geometry, grid, [body]) < 6e-3  # blur by voxels up to 1.2 mm; 4.9e-3 is the worst of 150 random scans
+    # blur by voxels up to 1.2 mm; 4.9e-3 is the worst of 150 random scans
+    assert _error(geometry, grid, [body]) < 6e-3
 
 
 @settings(max_examples=10, deadline=None)
-@given(start=st.floats(0, 2 * math.pi), curved=st.booleans(), cz=st.floats(-4, 4), cx=st.floats(-30, 30))
+@given(
+    start=st.floats(0, 2 * math.pi),
+    curved=st.booleans(),
+    cz=st.floats(-4, 4),
+    cx=st.floats(-30, 30),
+)
 def test_gaussians_in_any_cone_beam(start, curved, cz, cx):
     geometry = ConeBeam(
-        full_turn(5, start), 200.0, 380.0, 120, 40, (1.7, 1.9), (0.3, 0.6), "curved" if curved else "flat"
+        full_turn(5, start),
+        200.0,
+        380.0,
+        120,
+        40,
+        (1.7, 1.9),
+        (0.3, 0.6),
+        "curved" if curved else "flat",
     )
     grid = VolumeGrid((30, 32, 28), (1.0, 0.9, 1.1), (cz, 5.0, cx))
     body = Gaussian((cz + 1, 4.0, cx - 1.0), (3.0, 2.5, 3.5), 0.8)
@@ -85,13 +111,17 @@ def test_rays_along_grid_lines_and_diagonals(angle):
         assert value.numpy()[0] == pytest.approx(expect, abs=1e-9)
 
 
-@pytest.mark.parametrize(("spacing", "center"), [(0.2, (0.0, -30.38, -29.63)), (0.4, (0.5, 20.0, 35.0))])
+@pytest.mark.parametrize(
+    ("spacing", "center"), [(0.2, (0.0, -30.38, -29.63)), (0.4, (0.5, 20.0, 35.0))]
+)
 def test_small_inset_far_from_the_axis(spacing, center):
     geometry = ConeBeam(full_turn(9, 0.2), 626.0, 1098.0, 1500, 40, (0.5, 0.35), detector="curved")
     n = round(11 / spacing)
     grid = VolumeGrid((n, round(9 / spacing), round(9 / spacing)), spacing, center)
     bodies = [
-        Gaussian(tuple(c + d for c, d in zip(center, shift, strict=True)), (0.8, 0.7, 0.9), 0.3, value)
+        Gaussian(
+            tuple(c + d for c, d in zip(center, shift, strict=True)), (0.8, 0.7, 0.9), 0.3, value
+        )
         for shift, value in (((2.0, 0.5, -0.4), 1.0), ((-2.0, -0.6, 0.5), -0.5))
     ]
     assert (
@@ -100,7 +130,8 @@ def test_small_inset_far_from_the_axis(spacing, center):
 
 
 ANGLES = full_turn(6, 0.2)
-PLANE, VOLUME = VolumeGrid((40, 36), 0.5, (1.0, -2.0)), VolumeGrid((28, 40, 36), 0.5, (0.5, 1.0, -2.0))
+PLANE = VolumeGrid((40, 36), 0.5, (1.0, -2.0))
+VOLUME = VolumeGrid((28, 40, 36), 0.5, (0.5, 1.0, -2.0))
 SCANS = {
     "parallel": (ParallelBeam(ANGLES, 90, 0.6), PLANE),
     "fan": (FanBeam(ANGLES, 150.0, 270.0, 110, 0.9, 0.3), PLANE),
@@ -130,10 +161,19 @@ def _moving_lines(geometry, body, motion):
 def test_moving_body(name, kind):
     geometry, grid = SCANS[name]
     scale = 1.0 if kind is Gaussian else 2.0
-    body = kind(tuple(c + 0.7 for c in grid.center), (1.6 * scale, 2.0 * scale, 1.8 * scale)[-grid.ndim :], 0.4, 0.02)
+    body = kind(
+        tuple(c + 0.7 for c in grid.center),
+        (1.6 * scale, 2.0 * scale, 1.8 * scale)[-grid.ndim :],
+        0.4,
+        0.02,
+    )
     x = torch.as_tensor(rasterize(grid, [body], 4))
     errors = []
-    for motion, assumed in ((_walk(grid.ndim), True), (np.zeros((6, grid.ndim)), True), (_walk(grid.ndim), False)):
+    for motion, assumed in (
+        (_walk(grid.ndim), True),
+        (np.zeros((6, grid.ndim)), True),
+        (_walk(grid.ndim), False),
+    ):
         exact = _moving_lines(geometry, body, motion)
         found = Projector(geometry, grid, motion=motion if assumed else None)(x).numpy()
         errors.append(float(np.linalg.norm(found - exact) / np.linalg.norm(exact)))
@@ -158,7 +198,10 @@ def test_shadow_follows_the_motion(name):
     motion = _walk(grid.ndim)
     x = torch.ones(grid.shape, dtype=torch.float64)
     window = footprint(geometry, grid, motion=motion)
-    whole, cropped = Projector(geometry, grid, motion=motion)(x), Projector(geometry, grid, window, motion)(x)
+    whole, cropped = (
+        Projector(geometry, grid, motion=motion)(x),
+        Projector(geometry, grid, window, motion)(x),
+    )
     torch.testing.assert_close(cropped.sum(), whole.sum(), rtol=1e-12, atol=0)
 
 
@@ -168,7 +211,11 @@ def test_vectors_move_against_the_object(name):
     motion = _walk(grid.ndim)
     still, moved = VectorGeometry.of(geometry).vectors, VectorGeometry.of(geometry, motion).vectors
     n = grid.ndim
-    np.testing.assert_allclose(still[:, n : 2 * n] - moved[:, n : 2 * n], motion[:, ::-1], atol=1e-12)
+    np.testing.assert_allclose(
+        still[:, n : 2 * n] - moved[:, n : 2 * n], motion[:, ::-1], atol=1e-12
+    )
     source = 0.0 if name == "parallel" else motion[:, ::-1]
-    np.testing.assert_allclose(still[:, :n] - moved[:, :n], np.broadcast_to(source, (6, n)), atol=1e-12)
+    np.testing.assert_allclose(
+        still[:, :n] - moved[:, :n], np.broadcast_to(source, (6, n)), atol=1e-12
+    )
     np.testing.assert_array_equal(still[:, 2 * n :], moved[:, 2 * n :])

@@ -1,4 +1,5 @@
-"""What every projector must do, over the registry of geometries; degenerate sizes, extreme numbers, odd orders."""
+"""What every projector must do, over the registry of geometries; degenerate sizes, extreme
+numbers, odd orders."""
 
 import math
 import tracemalloc
@@ -42,13 +43,21 @@ def test_dense_matrix_of_both_directions_agrees(name):
     n, m = torch.Size(A.domain_shape).numel(), torch.Size(A.range_shape).numel()
     forward = A(torch.eye(n, dtype=torch.float64).reshape(n, *A.domain_shape)).reshape(n, m)
     # Cone-beam volumes pass one by one: a random part of the readings.
-    some = torch.randperm(m, generator=torch.Generator().manual_seed(0))[: 120 if len(A.domain_shape) == 3 else m]
-    adjoint = A.T(torch.eye(m, dtype=torch.float64)[some].reshape(-1, *A.range_shape)).reshape(-1, n)
-    torch.testing.assert_close(forward[:, some], adjoint.T, rtol=0, atol=1e-12 * float(forward.abs().max()))
+    some = torch.randperm(m, generator=torch.Generator().manual_seed(0))[
+        : 120 if len(A.domain_shape) == 3 else m
+    ]
+    adjoint = A.T(torch.eye(m, dtype=torch.float64)[some].reshape(-1, *A.range_shape)).reshape(
+        -1, n
+    )
+    torch.testing.assert_close(
+        forward[:, some], adjoint.T, rtol=0, atol=1e-12 * float(forward.abs().max())
+    )
     assert float(forward.min()) > -1e-12 * float(forward.max())
 
 
-@pytest.mark.parametrize("name", ["parallel_half_turn", "fan_window", "cone_window", "cone_curved_offset"])
+@pytest.mark.parametrize(
+    "name", ["parallel_half_turn", "fan_window", "cone_window", "cone_curved_offset"]
+)
 def test_gradients_of_first_and_second_order(name):
     A = _projector(name)
     x = _random((2, *A.domain_shape)).requires_grad_()
@@ -60,19 +69,27 @@ def test_gradients_of_first_and_second_order(name):
 
 
 SOME = [
-    "parallel_half_turn", "fan_flat", "fan_flat_offset_shifted_grid", "fan_symmetric_shifted_grid",
-    "cone_curved_offset", "cone_window",
-]  # fmt: skip
+    "parallel_half_turn",
+    "fan_flat",
+    "fan_flat_offset_shifted_grid",
+    "fan_symmetric_shifted_grid",
+    "cone_curved_offset",
+    "cone_window",
+]
 
 
-# --- geometry -------------------------------------------------------------------------------------------------------
+# --- geometry -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("scale", [1e-3, 7.0, 1e4])
 def test_scaling_every_length_scales_the_line_integrals(scale):
     def build(s):
-        geometry = ConeBeam(full_turn(4, 0.1), 60 * s, 110 * s, 14, 9, (1.8 * s, 2.5 * s), (0.2 * s, 0.5 * s))
-        return Projector(geometry, VolumeGrid((5, 7, 6), (1.5 * s, 2 * s, 2.2 * s), (0.4 * s, s, -2 * s)))
+        geometry = ConeBeam(
+            full_turn(4, 0.1), 60 * s, 110 * s, 14, 9, (1.8 * s, 2.5 * s), (0.2 * s, 0.5 * s)
+        )
+        return Projector(
+            geometry, VolumeGrid((5, 7, 6), (1.5 * s, 2 * s, 2.2 * s), (0.4 * s, s, -2 * s))
+        )
 
     x = _random((5, 7, 6))
     torch.testing.assert_close(build(scale)(x), build(1.0)(x) * scale, rtol=1e-9, atol=1e-9 * scale)
@@ -93,7 +110,9 @@ def test_views_in_any_order_and_repeated(name):
     order = np.array([3, 1, 3, 0, 2, 1])
     x = _random(grid.shape)
     whole = Projector(geometry, grid)(x)
-    torch.testing.assert_close(Projector(geometry.select(order), grid)(x), whole[order], rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(
+        Projector(geometry.select(order), grid)(x), whole[order], rtol=1e-12, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize(
@@ -112,11 +131,18 @@ def test_symmetric_views_share_work_and_read_the_same(name, operations, reach):
     A = Projector(geometry, grid)
     passes = A._engine.cpu
     x = _random((3, *grid.shape))
-    assert (passes.operations, len(passes.tables(np.dtype(np.float64), passes.lanes(3)).reach)) == (operations, reach)
-    singly = torch.cat([Projector(geometry.select([v]), grid)(x) for v in range(geometry.views)], dim=-2)
+    assert (passes.operations, len(passes.tables(np.dtype(np.float64), passes.lanes(3)).reach)) == (
+        operations,
+        reach,
+    )
+    singly = torch.cat(
+        [Projector(geometry.select([v]), grid)(x) for v in range(geometry.views)], dim=-2
+    )
     # A ray along an exact diagonal takes rows or columns; its symmetric copies may take the other.
     even = geometry.columns % 2 == 0 or geometry.offset != 0
-    torch.testing.assert_close(A(x), singly, rtol=0, atol=(1e-12 if even else 0.2) * float(singly.abs().max()))
+    torch.testing.assert_close(
+        A(x), singly, rtol=0, atol=(1e-12 if even else 0.2) * float(singly.abs().max())
+    )
 
 
 @pytest.mark.parametrize("name", ["fan_window", "cone_window"])
@@ -152,7 +178,7 @@ def test_cells_of_a_tenth_of_a_micrometre_add_up_to_a_larger_cell():
     torch.testing.assert_close(fine.mean(-1), coarse[:, 0], rtol=1e-9, atol=0)
 
 
-# --- numbers --------------------------------------------------------------------------------------------------------
+# --- numbers --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", SOME)
@@ -174,7 +200,7 @@ def test_nan_and_inf_reach_every_reading_that_sees_them(name, bad):
     assert not torch.isfinite(A.T(y)[touched]).any()
 
 
-# --- operator -------------------------------------------------------------------------------------------------------
+# --- operator -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -199,7 +225,11 @@ def test_one_thread_or_two_give_the_same_bits(name):
 def test_batches_of_any_size_and_layout(name, dtype):
     """Of a cone beam a batch is its single volumes to the bit."""
     A = _projector(name)
-    close = {"rtol": 0, "atol": 0} if len(A.domain_shape) == 3 else {"rtol": 100 * EPS[dtype], "atol": 10 * EPS[dtype]}
+    close = (
+        {"rtol": 0, "atol": 0}
+        if len(A.domain_shape) == 3
+        else {"rtol": 100 * EPS[dtype], "atol": 10 * EPS[dtype]}
+    )
     x = _random((11, *A.domain_shape), dtype)
     whole = A(x)
     for n in (0, 1, 2, 3, 9):
@@ -295,7 +325,8 @@ def test_chunks_of_views_give_the_same_bits(name, monkeypatch):
 
 
 def test_nan_and_inf_do_not_leak_into_other_cells_of_slabs_far_apart():
-    # Slabs farther apart than the depth layers are interpolated one by one, through a buffer that cells share.
+    # Slabs farther apart than the depth layers are interpolated one by one, through a buffer that
+    # cells share.
     A = Projector(*REGISTRY["cone_flat"])
     x = torch.zeros(A.domain_shape, dtype=torch.float64)
     x[:, 0, 0] = float("nan")

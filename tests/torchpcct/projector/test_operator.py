@@ -70,18 +70,23 @@ def test_pylops_takes_it(A):
     assert isinstance(P, pylops.LinearOperator)
     assert pylops.utils.dottest(P, rtol=1e-9, raiseerror=False)
     x = np.random.default_rng(0).standard_normal(P.shape[1])
-    np.testing.assert_allclose(P @ x, A(torch.from_numpy(x).reshape(A.domain_shape)).numpy().ravel(), rtol=1e-12)
+    np.testing.assert_allclose(
+        P @ x, A(torch.from_numpy(x).reshape(A.domain_shape)).numpy().ravel(), rtol=1e-12
+    )
 
 
 @pytest.fixture(scope="module")
 def deepinv():
-    """It imports torchvision, whose compiled operators (no one is used here) lack beside a PyTorch for CPUs alone,
-    unless torchvision is of https://download.pytorch.org/whl/cpu, too; it then looks for two of them in vain."""
+    """It imports torchvision, whose compiled operators (no one is used here) lack beside a PyTorch
+    for CPUs alone, unless torchvision is of https://download.pytorch.org/whl/cpu, too; it then
+    looks for two of them in vain."""
     if importlib.util.find_spec("deepinv") is None:
         pytest.skip("deepinv is not installed")
     if torch.version.cuda is None and "+cpu" not in importlib.metadata.version("torchvision"):
         for name in ("nms", "qnms"):
-            torch.library.define(f"torchvision::{name}", "(Tensor boxes, Tensor scores, float threshold) -> Tensor")
+            torch.library.define(
+                f"torchvision::{name}", "(Tensor boxes, Tensor scores, float threshold) -> Tensor"
+            )
     return importlib.import_module("deepinv")
 
 
@@ -90,7 +95,9 @@ def test_deepinv_takes_it(A, deepinv):
     assert isinstance(physics, deepinv.physics.LinearPhysics)
     x = torch.randn(2, 1, *A.domain_shape)
     assert torch.equal(physics.A(x), A(x))
-    assert float(physics.adjointness_test(x)) == pytest.approx(0.0, abs=1e-3 * float(A(x).square().sum()))
+    assert float(physics.adjointness_test(x)) == pytest.approx(
+        0.0, abs=1e-3 * float(A(x).square().sum())
+    )
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
@@ -105,7 +112,8 @@ def test_narrow_numbers_are_computed_in_float32(A, dtype):
 
 
 def test_autocast(A):
-    """A network before the projector leaves bfloat16; the loss and its gradient are those of float32 from there on."""
+    """A network before the projector leaves bfloat16; the loss and its gradient are those of
+    float32 from there on."""
     layer = torch.nn.Linear(A.domain_shape[-1], A.domain_shape[-1])
     x = torch.rand(*A.domain_shape)
     with torch.autocast("cpu", dtype=torch.bfloat16):
@@ -129,7 +137,8 @@ class _Step(torch.nn.Module):
 
 @pytest.mark.slow  # the tracer takes seconds to load
 def test_compiled_and_exported(A):
-    """To the tracer a pass is one operation, in a whole graph, with its gradient; a copy has a handle of its own."""
+    """To the tracer a pass is one operation, in a whole graph, with its gradient; a copy has a
+    handle of its own."""
     step, x = _Step(A), torch.rand(2, *A.domain_shape)
     expected = step(x)
     compiled = torch.compile(step, backend="aot_eager", fullgraph=True)
@@ -185,8 +194,11 @@ for _ in range(5):
 
 @pytest.mark.extended
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this platform")
-@pytest.mark.parametrize("used", ["before", "meanwhile", pytest.param("never", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "used", ["before", "meanwhile", pytest.param("never", marks=pytest.mark.slow)]
+)
 def test_a_forked_process_computes_on_threads_of_its_own(used):
-    """After its parent has projected; while another thread of the parent projects; with a parent that never did."""
+    """After its parent has projected; while another thread of the parent projects; with a parent
+    that never did."""
     done = run_python(CHILD, used, check=False, PYTHONWARNINGS="ignore")
     assert done.stdout.splitlines() == ["status 0"] * 5, done.stdout + done.stderr

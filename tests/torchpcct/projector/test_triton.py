@@ -1,4 +1,5 @@
-"""The Triton kernels against the CPU kernels, run by Triton's interpreter (``tests/conftest.py`` asks for it)."""
+"""The Triton kernels against the CPU kernels, run by Triton's interpreter (``tests/conftest.py``
+asks for it)."""
 
 import sys
 
@@ -14,16 +15,27 @@ from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.projector.cuda.passes import GpuPasses, slices
 
-pytestmark = pytest.mark.skipif(not knobs.runtime.interpret, reason="TRITON_INTERPRET=0: kernels need a GPU")
+pytestmark = pytest.mark.skipif(
+    not knobs.runtime.interpret, reason="TRITON_INTERPRET=0: kernels need a GPU"
+)
 CPU = torch.device("cpu")
-_PLANE, _VOLUME = VolumeGrid((4, 3), (2.0, 1.7), (1.0, -0.5)), VolumeGrid((3, 2, 3), (1.5, 2.0, 2.2), (0.4, 1.0, -1.0))
+_PLANE = VolumeGrid((4, 3), (2.0, 1.7), (1.0, -0.5))
+_VOLUME = VolumeGrid((3, 2, 3), (1.5, 2.0, 2.2), (0.4, 1.0, -1.0))
 CASES = {
     "parallel": (ParallelBeam([0.1, 2.0], 5, 1.7, 0.4), _PLANE, None),
     "fan": (FanBeam([0.3, 0.8], 30.0, 60.0, 6, 3.0, 0.5), _PLANE, None),
-    "fan window": (FanBeam([4.0], 30.0, 60.0, 20, 1.0, detector="curved"), _PLANE, DetectorWindow([7], 5)),
+    "fan window": (
+        FanBeam([4.0], 30.0, 60.0, 20, 1.0, detector="curved"),
+        _PLANE,
+        DetectorWindow([7], 5),
+    ),
     "cone": (ConeBeam([0.7], 60.0, 110.0, 4, 3, (1.7, 2.5), (0.6, -0.6)), _VOLUME, None),
     # So far from the source that slabs share depth layers.
-    "cone layered": (ConeBeam([2.4], 600.0, 1100.0, 4, 3, (1.7, 2.5), detector="curved"), _VOLUME, None),
+    "cone layered": (
+        ConeBeam([2.4], 600.0, 1100.0, 4, 3, (1.7, 2.5), detector="curved"),
+        _VOLUME,
+        None,
+    ),
 }
 
 
@@ -48,11 +60,14 @@ def test_slices_that_fit_the_memory_give_the_same_bits(name, monkeypatch):
     A = Projector(geometry, grid, window)
     passes = A._engine.on(CPU)
     generator = torch.Generator().manual_seed(0)
-    x, y = (torch.randn((2, *shape), generator=generator) for shape in (A.domain_shape, A.range_shape))
+    x, y = (
+        torch.randn((2, *shape), generator=generator) for shape in (A.domain_shape, A.range_shape)
+    )
     whole = passes.forward(x), passes.adjoint(y)
     assert slices(passes.tables, None, 2, 4) == (2, 2)
     assert slices(passes.tables, 1, 2, 4) == (1, 1)
-    monkeypatch.setattr(GpuPasses, "_budget", lambda self: 1)  # so little that everything goes one by one
+    # so little that everything goes one by one
+    monkeypatch.setattr(GpuPasses, "_budget", lambda self: 1)
     assert torch.equal(passes.forward(x), whole[0])
     assert torch.equal(passes.adjoint(y), whole[1])
     assert 0 < A.memory_estimate(1, device="cuda") < A.memory_estimate(2, device="cuda")

@@ -1,4 +1,5 @@
-"""Pile-up, charge sharing and photons followed through the silicon detector, against closed forms and event lists."""
+"""Pile-up, charge sharing and photons followed through the silicon detector, against closed
+forms and event lists."""
 
 from dataclasses import replace
 
@@ -17,14 +18,16 @@ ENERGIES = np.array([25.0, 45.0, 70.0, 95.0])
 QUANTA = np.array([2e6, 8e6, 6e6, 1e6])
 
 
-# --- pile-up ------------------------------------------------------------------------------------------------------
+# --- pile-up --------------------------------------------------------------------------------------
 
 
 def test_without_dead_time_rates_are_quanta_times_response():
     for mode in ("counting", "spectral"):
         detector = SiliconDetector(mode)
         np.testing.assert_allclose(
-            recorded_rates(detector, ENERGIES, QUANTA), detector.response(ENERGIES) @ QUANTA, rtol=1e-12
+            recorded_rates(detector, ENERGIES, QUANTA),
+            detector.response(ENERGIES) @ QUANTA,
+            rtol=1e-12,
         )
 
 
@@ -34,7 +37,9 @@ def test_one_segment_is_non_paralysable():
     recorded = recorded_rates(detector, ENERGIES, QUANTA)[0]
     assert recorded == pytest.approx(true / (1 + 80e-9 * true), rel=1e-12)
     # Three segments share the load, each with the photons that interact in it.
-    parts = (detector.response(ENERGIES)[0] * QUANTA) @ replace(detector, segments=3).segment_shares(ENERGIES).T
+    parts = (detector.response(ENERGIES)[0] * QUANTA) @ replace(
+        detector, segments=3
+    ).segment_shares(ENERGIES).T
     split = recorded_rates(replace(detector, segments=3), ENERGIES, QUANTA)[0]
     assert split == pytest.approx(float((parts / (1 + 80e-9 * parts)).sum()), rel=1e-12)
     # More segments lose less, and the counting mode is the sum of the bins.
@@ -57,7 +62,8 @@ def test_merged_pulses_against_a_list_of_events():
     rate = float((photo + compton) @ QUANTA)
     n = rng.poisson(rate * duration)
     times = np.sort(rng.uniform(0, duration, n))
-    cumulative = detector.above(ENERGIES, np.arange(-12.0, 120.0, 0.05)) @ QUANTA / rate  # survival of the height
+    # survival of the height
+    cumulative = detector.above(ENERGIES, np.arange(-12.0, 120.0, 0.05)) @ QUANTA / rate
     heights = np.interp(-rng.random(n), -cumulative, np.arange(-12.0, 120.0, 0.05))
     recorded, free_at, i = [], -1.0, 0
     while i < n:
@@ -97,7 +103,9 @@ def test_the_map_is_off_by_default_and_reproduces_the_rates():
 
 def test_scans_with_pile_up_lose_counts_and_stay_linear_in_water():
     system = presets.pcct(views=4, detector=SiliconDetector(dead_time_ns=50.0))
-    system = system.replace(geometry=replace(system.geometry, rows=1), source=replace(system.source, focal_spot=(0, 0)))
+    system = system.replace(
+        geometry=replace(system.geometry, rows=1), source=replace(system.source, focal_spot=(0, 0))
+    )
     ideal = system.replace(detector=SiliconDetector())
     scan, free = (acquire(water_cylinder(200.0), s, sub_rays=1, duty=1e-6) for s in (system, ideal))
     lost = 1 - scan.air / free.air
@@ -116,7 +124,7 @@ def test_scans_with_pile_up_lose_counts_and_stay_linear_in_water():
     assert (wrong[740:760] / (free.linearisation.mu_ref * chord[740:760]) < 0.9).all()
 
 
-# --- photons followed ---------------------------------------------------------------------------------------------
+# --- photons followed -----------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +132,11 @@ def followed():
     scanner = presets.pcct()
     energies, quanta = scanner.quanta()
     beam = quanta[750] * np.exp(-material("pericoronary_fat").attenuation(energies) * 240.0)
-    return energies, beam, follow(SiliconDetector(), energies, beam, 60_000, np.random.default_rng(1))
+    return (
+        energies,
+        beam,
+        follow(SiliconDetector(), energies, beam, 60_000, np.random.default_rng(1)),
+    )
 
 
 def test_first_interactions_are_the_one_interaction_model(followed):
@@ -155,11 +167,20 @@ def test_energy_is_conserved_and_photons_count_repeatedly(followed):
 
 def test_compton_deposits_have_the_mean_of_klein_and_nishina():
     n = 40_000
-    deposits = follow(SiliconDetector(fill_factor=1.0), [80.0], [1.0], n, np.random.default_rng(4), Stack(foil_mm=0.0))
+    deposits = follow(
+        SiliconDetector(fill_factor=1.0),
+        [80.0],
+        [1.0],
+        n,
+        np.random.default_rng(4),
+        Stack(foil_mm=0.0),
+    )
     first = deposits.order == 0
     compton = deposits.energy_kev[first & (deposits.energy_kev < 79.9)]
     expected = 80.0 * float(mean_recoil_fraction(80.0)[0])
-    assert compton.mean() == pytest.approx(expected, abs=4.5 * compton.std() / np.sqrt(compton.size))
+    assert compton.mean() == pytest.approx(
+        expected, abs=4.5 * compton.std() / np.sqrt(compton.size)
+    )
     photo, scattered = SiliconDetector(fill_factor=1.0).interaction([80.0])
     share = float(scattered[0] / (photo + scattered)[0])
     assert compton.size / first.sum() == pytest.approx(share, abs=4.5 * 0.5 / np.sqrt(n))
@@ -168,7 +189,9 @@ def test_compton_deposits_have_the_mean_of_klein_and_nishina():
 def test_foils_stop_scattered_photons():
     rng = np.random.default_rng(5)
     k = [
-        follow(SiliconDetector(), [70.0], [1.0], 8000, rng, Stack(foil_mm=f)).counts(-1e9, 1.0, rng).mean()
+        follow(SiliconDetector(), [70.0], [1.0], 8000, rng, Stack(foil_mm=f))
+        .counts(-1e9, 1.0, rng)
+        .mean()
         for f in (0.0, 0.005, 0.02)
     ]
     assert k[0] > 1.5 > k[1] > 1.1 > k[2]

@@ -24,13 +24,31 @@ def eid():
 
 def test_published_geometry(pcct, eid):
     g = pcct.geometry
-    assert (g.sod, g.sdd, g.columns, g.rows, g.views, g.detector) == (626.0, 1098.0, 1500, 40, 1968, "curved")
+    assert (g.sod, g.sdd, g.columns, g.rows, g.views, g.detector) == (
+        626.0,
+        1098.0,
+        1500,
+        40,
+        1968,
+        "curved",
+    )
     assert (g.pitch, pcct.source.focal_spot, pcct.source.kvp) == ((0.50, 0.35), (0.5, 0.5), 100.0)
     assert 2 * g.fov_radius == pytest.approx(296, abs=1)
     assert presets.pcct(quarter_offset=True).geometry.offset[1] == pytest.approx(0.35 / 4)
     g = eid.geometry
-    assert (g.sod, g.sdd, g.columns, g.rows, g.views, g.detector) == (541.0, 949.0, 888, 64, 984, "curved")
-    assert (g.pitch, eid.source.focal_spot, eid.source.current_ma) == ((1.0988, 1.0239), (0.9, 0.7), 1000.0)
+    assert (g.sod, g.sdd, g.columns, g.rows, g.views, g.detector) == (
+        541.0,
+        949.0,
+        888,
+        64,
+        984,
+        "curved",
+    )
+    assert (g.pitch, eid.source.focal_spot, eid.source.current_ma) == (
+        (1.0988, 1.0239),
+        (0.9, 0.7),
+        1000.0,
+    )
     assert g.offset == (0.0, pytest.approx(-1.25 * 1.0239))
 
 
@@ -51,7 +69,9 @@ def test_a_flat_detector_loses_by_the_cube_of_the_cosine(pcct):
     g = bare.geometry
     flat = bare.replace(geometry=ConeBeam((0.0,), g.sod, g.sdd, 501, 1, (0.5, 1.0)))
     quanta = flat.quanta()[1].sum(1)
-    np.testing.assert_allclose(quanta / quanta[250], np.cos(flat.geometry.fan_angles) ** 3, rtol=1e-12)
+    np.testing.assert_allclose(
+        quanta / quanta[250], np.cos(flat.geometry.fan_angles) ** 3, rtol=1e-12
+    )
 
 
 def test_row_factor_is_inverse_square_times_obliquity(pcct):
@@ -59,7 +79,9 @@ def test_row_factor_is_inverse_square_times_obliquity(pcct):
     assert pcct.row_factor.shape == (40,)
     z = g.row_positions[0]
     distance = np.hypot(g.sdd, z)
-    assert pcct.row_factor[0] == pytest.approx((g.sdd / distance) ** 2 * (g.sdd / distance), rel=1e-14)
+    assert pcct.row_factor[0] == pytest.approx(
+        (g.sdd / distance) ** 2 * (g.sdd / distance), rel=1e-14
+    )
     assert pcct.row_factor[0] == pcct.row_factor[-1] < pcct.row_factor[19] < 1
 
 
@@ -88,12 +110,18 @@ def test_arrays_are_read_only(pcct):
         pcct.weights()[1][0, 0, 0] = 1.0
 
 
-@pytest.mark.parametrize("make", [presets.pcct, presets.eid, lambda: presets.pcct(mode="spectral", columns=8)])
+@pytest.mark.parametrize(
+    "make", [presets.pcct, presets.eid, lambda: presets.pcct(mode="spectral", columns=8)]
+)
 def test_water_reads_linear_from_0_to_380_mm(make):
     """Of the sum of all energy bins, where there are several."""
     scanner = make()
     energies, weights = scanner.weights()
-    mu, w, lin = material("water").attenuation(energies), weights.sum(0), scanner.water_linearisation()
+    mu, w, lin = (
+        material("water").attenuation(energies),
+        weights.sum(0),
+        scanner.water_linearisation(),
+    )
     for t in (0.01, 1.0, 7.0, 33.0, 100.0, 171.0, 240.0, 333.0, 380.0):
         p = -np.log((w * np.exp(-mu * t)).sum(-1) / w.sum(-1))
         linear = lin.apply(torch.from_numpy(p)).numpy() / (lin.mu_ref * t)
@@ -108,7 +136,9 @@ def test_the_water_correction_is_tame_outside_its_range(pcct):
     assert (torch.diff(out, dim=0) > 0).all()
     assert torch.equal(lin.apply(torch.zeros(1500)), torch.zeros(1500))
     slope = lin.slope(torch.full((1500,), -0.1, dtype=torch.float64))
-    np.testing.assert_allclose(lin.apply(torch.full((1500,), -0.1, dtype=torch.float64)), -0.1 * slope, rtol=1e-12)
+    np.testing.assert_allclose(
+        lin.apply(torch.full((1500,), -0.1, dtype=torch.float64)), -0.1 * slope, rtol=1e-12
+    )
 
 
 def test_coarser_energy_bins_change_little(pcct):
@@ -118,7 +148,9 @@ def test_coarser_energy_bins_change_little(pcct):
         for s, behind in ((s, s.behind({material("water"): 200.0})[0, 750]) for s in (pcct, coarse))
     )
     np.testing.assert_allclose(hu, fine_hu, atol=3.0)
-    assert coarse.weights()[1][0, 750].sum() == pytest.approx(pcct.weights()[1][0, 750].sum(), rel=0.01)
+    assert coarse.weights()[1][0, 750].sum() == pytest.approx(
+        pcct.weights()[1][0, 750].sum(), rel=0.01
+    )
 
 
 def test_scanners_are_values(pcct):

@@ -1,4 +1,5 @@
-"""A silicon detector that follows its photons: against the reference that it is made from, and in a scanner."""
+"""A silicon detector that follows its photons: against the reference that it is made from, and
+in a scanner."""
 
 import numpy as np
 import pytest
@@ -22,7 +23,8 @@ def test_counts_are_those_of_followed_photons(detector, energy):
         counted = deposits.counts(threshold, detector.sigma_kev, rng)
         expected = detector.above([energy], [threshold])[0, 0]
         error = counted.std() / photons**0.5
-        assert counted.mean() == pytest.approx(expected, abs=4 * error + 0.03)  # 2000 photons made the expectation
+        # 2000 photons made the expectation
+        assert counted.mean() == pytest.approx(expected, abs=4 * error + 0.03)
         assert detector.response([energy])[k:].sum() == pytest.approx(expected, abs=1e-9)
 
 
@@ -36,13 +38,17 @@ def test_repeated_interactions_add_counts_in_the_low_bins(detector):
 def test_nothing_beyond_the_first_interaction_without_scatter(detector):
     """Soft photons are absorbed at once."""
     soft = [12.0, 15.0]
-    np.testing.assert_allclose(detector.response(soft), SiliconDetector("spectral").response(soft), atol=0.01)
+    np.testing.assert_allclose(
+        detector.response(soft), SiliconDetector("spectral").response(soft), atol=0.01
+    )
 
 
 def test_bins_sum_to_the_count_and_repeat(detector):
     energies = [45.0, 72.5]
     counting = TransportedSilicon("counting", photons=detector.photons)
-    np.testing.assert_allclose(counting.response(energies)[0], detector.response(energies).sum(0), rtol=1e-9)
+    np.testing.assert_allclose(
+        counting.response(energies)[0], detector.response(energies).sum(0), rtol=1e-9
+    )
     again = TransportedSilicon("spectral", photons=detector.photons)
     np.testing.assert_array_equal(again.response(energies), detector.response(energies))
     assert hash(again) == hash(detector)

@@ -38,14 +38,17 @@ SHAPES = {
 def rays(rng, n, reach, height, spread=2.5):
     """Lines from a source orbit, ``height`` mm around the mid plane, to points around PLACE."""
     beta = rng.uniform(0, 2 * math.pi, n)
-    o = np.stack([reach * np.cos(beta), reach * np.sin(beta), height * rng.uniform(-1, 1, n)], axis=1)
+    o = np.stack(
+        [reach * np.cos(beta), reach * np.sin(beta), height * rng.uniform(-1, 1, n)], axis=1
+    )
     target = np.array(PLACE) + rng.uniform(-1, 1, (n, 3)) * (spread, spread, 1.6 * spread)
     d = target - o
     return o, d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
 def crossings(shape, o, d, half=8.0):
-    """Ends of the chords by a dense scan and bisection in numpy: total length to 1e-11 mm, number of pieces."""
+    """Ends of the chords by a dense scan and bisection in numpy: total length to 1e-11 mm,
+    number of pieces."""
     t = (np.array(PLACE) - o) @ d + np.linspace(-half, half, 4001)
     flags = shape.contains(o + t[:, None] * d)
     k = np.flatnonzero(flags[1:] != flags[:-1])
@@ -65,7 +68,9 @@ def test_chords_equal_the_bisected_ends(name, height):
     shape = SHAPES[name]
     o, d = (
         np.concatenate(pair)
-        for pair in zip(rays(rng, 15, 626.0, height), rays(rng, 15, 626.0, height, 0.6), strict=True)
+        for pair in zip(
+            rays(rng, 15, 626.0, height), rays(rng, 15, 626.0, height, 0.6), strict=True
+        )
     )
     (lengths,) = chord_lengths([shape], o, d)
     hit = 0
@@ -73,7 +78,8 @@ def test_chords_equal_the_bisected_ends(name, height):
         expected, pieces = crossings(shape, o[n], d[n])
         # A piece shorter than the scan's 4e-3 mm step escapes the reference, not the kernel.
         tolerance = 1e-9 if pieces else 4e-3
-        # Near grazing the end points are ill-conditioned: an offset of 1e-13 mm moves them by sqrt(1e-13).
+        # Near grazing the end points are ill-conditioned: an offset of 1e-13 mm moves them by
+        # sqrt(1e-13).
         if expected < 0.05:
             tolerance = max(tolerance, 8e-3)
         assert lengths[n] == pytest.approx(expected, abs=tolerance), (n, pieces)
@@ -83,7 +89,8 @@ def test_chords_equal_the_bisected_ends(name, height):
 
 @pytest.mark.parametrize("name", ["strong bulge", "bulged"])
 def test_a_steep_ray_may_cross_a_bulge_twice(name):
-    """Lines almost along the tube that cut both concave flanks: the kernel returns the total of all pieces."""
+    """Lines almost along the tube that cut both concave flanks: the kernel returns the total of
+    all pieces."""
     shape = SHAPES[name]
     rng = np.random.default_rng(3)
     most = 0
@@ -109,10 +116,16 @@ def test_closed_forms():
     cylinder = EllipticCylinder(120.0)
     for slope in (0.0, 0.01, 0.3):
         length = chord_lengths([cylinder], (-626.0, 50.0, 0.0), (1.0, 0.0, slope))[0, 0]
-        assert length == pytest.approx(2 * math.sqrt(120.0**2 - 50.0**2) * math.hypot(1, slope), abs=1e-9)
+        assert length == pytest.approx(
+            2 * math.sqrt(120.0**2 - 50.0**2) * math.hypot(1, slope), abs=1e-9
+        )
     cube = Box(1.0)
-    assert chord_lengths([cube], (-5.0, 0.0, 0.0), (1.0, 0.0, 0.0))[0, 0] == pytest.approx(2.0, abs=1e-12)
-    assert chord_lengths([cube], (-5.0, -5.0, -5.0), (1.0, 1.0, 1.0))[0, 0] == pytest.approx(2 * 3**0.5, abs=1e-12)
+    assert chord_lengths([cube], (-5.0, 0.0, 0.0), (1.0, 0.0, 0.0))[0, 0] == pytest.approx(
+        2.0, abs=1e-12
+    )
+    assert chord_lengths([cube], (-5.0, -5.0, -5.0), (1.0, 1.0, 1.0))[0, 0] == pytest.approx(
+        2 * 3**0.5, abs=1e-12
+    )
     assert chord_lengths([cube], (-5.0, 1.5, 0.0), (1.0, 0.0, 0.0))[0, 0] == 0.0
 
 
@@ -124,12 +137,15 @@ def test_along_the_axis():
     assert chord_lengths([finite], (0.5, 0.0, -9.0), up)[0, 0] == pytest.approx(6.0, abs=1e-12)
     assert chord_lengths([endless], (0.5, 0.0, -9.0), up)[0, 0] == math.inf
     assert chord_lengths([endless], (2.5, 0.0, -9.0), up)[0, 0] == 0.0
-    assert chord_lengths([tube, narrow], (0.0, 0.0, -9.0), up)[:, 0] == pytest.approx([9.66, 9.66], abs=1e-12)
+    assert chord_lengths([tube, narrow], (0.0, 0.0, -9.0), up)[:, 0] == pytest.approx(
+        [9.66, 9.66], abs=1e-12
+    )
     # At x = R + d(1) the line is inside the bulge for |z| < z* with R + 2 d(z*) = x.
     x = 1.68 + 0.45
     expected = 2 * 6.0 / math.pi * math.acos(math.sqrt(0.5))
     assert chord_lengths([tube], (x, 0.0, -9.0), up)[0, 0] == pytest.approx(expected, abs=1e-10)
-    # In the narrowed tube the same x is outside where the lumen's edge 2 R²/(R + d) - R lies below it.
+    # In the narrowed tube the same x is outside where the lumen's edge 2 R²/(R + d) - R lies below
+    # it.
     x = 1.2
     d = 2 * 1.49**2 / (x + 1.49) - 1.49
     expected = 9.66 - 2 * 6.0 / math.pi * math.acos(math.sqrt(d / 0.45))
@@ -149,11 +165,14 @@ number = st.floats(-1.0, 1.0)
     seed=st.integers(0, 10**6),
 )
 def test_moving_everything_changes_nothing(name, angle, axis, shift, seed):
-    """A rigid motion of shape and ray together, the reverse ray and another starting point give the same chord."""
+    """A rigid motion of shape and ray together, the reverse ray and another starting point give
+    the same chord."""
     shape = SHAPES[name]
     o, d = rays(np.random.default_rng(seed), 4, 300.0, 100.0)
     turn, move = rotation_matrix(axis, angle), 20.0 * np.array(shift)
-    moved = replace(shape, position=tuple(turn @ shape.position + move), rotation=turn @ shape.matrix)
+    moved = replace(
+        shape, position=tuple(turn @ shape.position + move), rotation=turn @ shape.matrix
+    )
     (reference,) = chord_lengths([shape], o, d)
     clear = reference > 0.1  # near grazing the chord is ill-conditioned
     for other in (
@@ -168,7 +187,10 @@ def test_moving_everything_changes_nothing(name, angle, axis, shift, seed):
 def test_bad_input_is_named():
     shape, bad = Ellipsoid(1.0), [(1.0, 0.0, 0.0), (math.nan, 0.0, 0.0)]
     refused(
-        ("origins must have the shape", lambda: chord_lengths([shape], np.zeros((2, 2)), (1.0, 0.0, 0.0))),
+        (
+            "origins must have the shape",
+            lambda: chord_lengths([shape], np.zeros((2, 2)), (1.0, 0.0, 0.0)),
+        ),
         ("directions must be finite, but row 1", lambda: chord_lengths([shape], np.zeros(3), bad)),
         ("row 0 is 0", lambda: chord_lengths([shape], np.zeros(3), np.zeros(3))),
         ("equally many", lambda: chord_lengths([shape], np.zeros((2, 3)), np.ones((3, 3)))),

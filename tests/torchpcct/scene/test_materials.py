@@ -1,4 +1,5 @@
-"""Materials: published compositions, the molecular derivation, attenuation, CT numbers, mixing, validation."""
+"""Materials: published compositions, the molecular derivation, attenuation, CT numbers, mixing,
+validation."""
 
 import copy
 import pickle
@@ -36,11 +37,21 @@ BASIS = {
 IN_DA = {"collagen": 26 / 57, "elastin": 31 / 57}
 RECIPES = {
     "vessel_wall": (0.70, {"FC": 6, "TG": 30, "CS": 2, **{k: 62 * v for k, v in IN_DA.items()}}),
-    "fibrous_tissue": (0.80, {"CE": 15, "FC": 30, "TG": 10, **{k: 45 * v for k, v in IN_DA.items()}}),
-    # The core is fibrous tissue with 10 % more collagen, 8 % more FC, 8 % more CE: sums to 126 %, normalised.
+    "fibrous_tissue": (
+        0.80,
+        {"CE": 15, "FC": 30, "TG": 10, **{k: 45 * v for k, v in IN_DA.items()}},
+    ),
+    # The core is fibrous tissue with 10 % more collagen, 8 % more FC, 8 % more CE: sums to 126 %,
+    # normalised.
     "necrotic_core": (
         0.75,
-        {"CE": 23, "FC": 38, "TG": 10, "collagen": 45 * IN_DA["collagen"] + 10, "elastin": 45 * IN_DA["elastin"]},
+        {
+            "CE": 23,
+            "FC": 38,
+            "TG": 10,
+            "collagen": 45 * IN_DA["collagen"] + 10,
+            "elastin": 45 * IN_DA["elastin"],
+        },
     ),
 }
 """Tissue: water's share of the mass, parts of the dry mass (any unit; normalised)."""
@@ -51,20 +62,24 @@ RESIDUES = {
     "proline": (12.7, {"C": 5, "H": 9, "N": 1, "O": 2}),
     "leucine": (6.5, {"C": 6, "H": 13, "N": 1, "O": 2}),
 }
-"""Amino acids of intimal elastin: per cent of the weight of residues (one water less each); the free acids."""
+"""Amino acids of intimal elastin: per cent of the weight of residues (one water less each); the
+free acids."""
 
 
 @pytest.mark.parametrize("name", RECIPES)
 def test_the_molecular_recipe_gives_the_published_element_table(name):
     water, dry = RECIPES[name]
     shares = {k: (1 - water) * part / sum(dry.values()) for k, part in dry.items()}
-    parts = {Material(k, 1.0, formula_mass_fractions(BASIS[k])): share for k, share in shares.items()}
+    parts = {
+        Material(k, 1.0, formula_mass_fractions(BASIS[k])): share for k, share in shares.items()
+    }
     derived, published = mixture(name, 1.0, {**parts, material("water"): water}), material(name)
     assert dict(derived.mass_fractions) == pytest.approx(dict(published.mass_fractions), abs=1e-4)
 
 
 def test_elastin_residues_give_the_published_formula():
-    """Atoms per 1000 units of residue weight; the sum of the abundances, 83.2 %, is not normalised."""
+    """Atoms per 1000 units of residue weight; the sum of the abundances, 83.2 %, is not
+    normalised."""
     formula = dict.fromkeys("CHNO", 0.0)
     for abundance, free in RESIDUES.values():
         residue = {**free, "H": free["H"] - 2, "O": free["O"] - 1}
@@ -85,7 +100,8 @@ def test_attenuation_is_the_mass_weighted_sum_of_the_elam_total_cross_sections()
     for name in ("blood_iodine", "water", "cortical_bone"):
         m = material(name)
         expected = sum(
-            fraction * xraydb.mu_elam(element, energies.ravel() * 1e3) for element, fraction in m.mass_fractions.items()
+            fraction * xraydb.mu_elam(element, energies.ravel() * 1e3)
+            for element, fraction in m.mass_fractions.items()
         )
         expected = expected.reshape(2, 3) * m.density_g_cm3 / 10
         np.testing.assert_allclose(m.attenuation(energies), expected, rtol=1e-13)
@@ -175,7 +191,8 @@ test_bad_input_is_refused_with_a_remedy = refusals(
 
 
 def test_a_concentration_of_iodine_by_its_name():
-    """10 mg in every ml; volumes add, so 1 - 0.01 / 4.93 of the ml is blood. About 30 HU for 1 mg/ml at 65 keV."""
+    """10 mg in every ml; volumes add, so 1 - 0.01 / 4.93 of the ml is blood. About 30 HU for 1
+    mg/ml at 65 keV."""
     blood, mixed = material("blood"), material("iodine 10 mg/ml in blood")
     assert mixed == solution("iodine", 10.0, "blood")
     assert mixed.mass_fractions["I"] * mixed.density_g_cm3 == pytest.approx(0.010, rel=1e-9)

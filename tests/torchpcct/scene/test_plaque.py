@@ -25,8 +25,12 @@ def test_place_and_size(paper):
     assert scene.is_static
     assert scene["patient"].shape.rotationally_symmetric
     assert [m.name for m in scene.materials] == [
-        "pericoronary_fat", "vessel_wall", "fibrous_tissue", "blood_iodine", "necrotic_core",
-    ]  # fmt: skip
+        "pericoronary_fat",
+        "vessel_wall",
+        "fibrous_tissue",
+        "blood_iodine",
+        "necrotic_core",
+    ]
 
 
 def test_minimum_cap_by_dense_sampling(paper):
@@ -43,7 +47,8 @@ def test_minimum_cap_by_dense_sampling(paper):
 
 
 @pytest.mark.parametrize(
-    "change", [{"cap_thickness": 0.065}, {"bulge": 0.6}, {"lumen_narrowing": 1.2}, {"orientation": 2.0}]
+    "change",
+    [{"cap_thickness": 0.065}, {"bulge": 0.6}, {"lumen_narrowing": 1.2}, {"orientation": 2.0}],
 )
 def test_parameters_keep_the_cap(change):
     scene, plaque = plaque_scene(**change)
@@ -77,8 +82,10 @@ def test_variants_are_valid_scenes(name):
     hu = dict(zip(scene.names, (m.hu(64.0) for m in scene.materials), strict=True))
     fibrous, core = 99.7, 39.7
     expected = {
-        "absent_core": fibrous, "half_contrast": (fibrous + core) / 2, "flipped_contrast": 2 * fibrous - core,
-    }.get(name, core)  # fmt: skip
+        "absent_core": fibrous,
+        "half_contrast": (fibrous + core) / 2,
+        "flipped_contrast": 2 * fibrous - core,
+    }.get(name, core)
     assert hu["core"] == pytest.approx(expected, abs=4)
     assert hu["fibrous"] == pytest.approx(core if name == "core_for_fibrous" else fibrous, abs=4)
     if name == "calcification":
@@ -99,10 +106,14 @@ def test_variants_are_valid_scenes(name):
 def test_mirrored_and_turned():
     (_, plaque), (scene, mirrored) = plaque_scene(), plaque_variant("mirrored")
     core = np.array(plaque.core.position) - plaque.position
-    np.testing.assert_allclose(np.array(mirrored.core.position) - mirrored.position, -core, atol=1e-12)
+    np.testing.assert_allclose(
+        np.array(mirrored.core.position) - mirrored.position, -core, atol=1e-12
+    )
     assert scene.labels(mirrored.core.position) == scene.index("core")
     scene, turned = plaque_variant("turned")
-    np.testing.assert_allclose(np.array(turned.core.position) - turned.position, (0.0, core[0], 0.0), atol=1e-12)
+    np.testing.assert_allclose(
+        np.array(turned.core.position) - turned.position, (0.0, core[0], 0.0), atol=1e-12
+    )
 
 
 def test_contrast_is_exactly_linear():
@@ -111,7 +122,9 @@ def test_contrast_is_exactly_linear():
     for weight in (-1.0, 0.0, 0.5, 1.0):
         mixed = interpolate_material("mixed", a, b, weight).attenuation(energies)
         np.testing.assert_allclose(
-            mixed, a.attenuation(energies) * (1 - weight) + b.attenuation(energies) * weight, rtol=1e-12
+            mixed,
+            a.attenuation(energies) * (1 - weight) + b.attenuation(energies) * weight,
+            rtol=1e-12,
         )
     with pytest.raises(ValueError, match="negative amount of"):
         interpolate_material("impossible", "water", "blood_iodine", -1.0)

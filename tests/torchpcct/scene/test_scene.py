@@ -38,7 +38,12 @@ def nested() -> Scene:
     return Scene(
         [
             Body("outer", EllipticCylinder(20.0), "pericoronary_fat"),
-            Body("ball", Ellipsoid((6.0, 5.0, 4.0), position=(3.0, 0.0, 0.0), rotation=0.3), "water", "outer"),
+            Body(
+                "ball",
+                Ellipsoid((6.0, 5.0, 4.0), position=(3.0, 0.0, 0.0), rotation=0.3),
+                "water",
+                "outer",
+            ),
             Body("core", Ellipsoid(1.5, position=(4.0, 1.0, 0.5)), "necrotic_core", "ball"),
             Body("box", Box(2.0, position=(-8.0, 0.0, 0.0)), "cortical_bone", "outer"),
         ]
@@ -60,7 +65,8 @@ def volume(shape):
 
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda s: type(s).__name__)
 def test_shape_is_consistent(shape):
-    """Surface points have level 1 and fill the bounding box, and so do random points inside their volume."""
+    """Surface points have level 1 and fill the bounding box, and so do random points inside
+    their volume."""
     surface = shape.surface_points(20000)
     level = shape.level(surface)
     assert level.max() <= 1.0 + 1e-9  # caps hold inner points of the end sections, too
@@ -72,7 +78,9 @@ def test_shape_is_consistent(shape):
     points = rng.uniform(low, high, (200_000, 3))
     inside = shape.contains(points)
     box = math.prod(high - low)
-    assert inside.mean() * box == pytest.approx(volume(shape), abs=4 * box * math.sqrt(0.25 / len(points)))
+    assert inside.mean() * box == pytest.approx(
+        volume(shape), abs=4 * box * math.sqrt(0.25 / len(points))
+    )
     assert not shape.contains(high + 0.1)
     np.testing.assert_allclose(shape.to_local(shape.to_scanner(points[:9])), points[:9], atol=1e-12)
 
@@ -95,15 +103,23 @@ def test_infinite_shapes():
 def test_rotational_symmetry_is_recognised():
     upright = rotation_matrix((1.0, 0.0, 0.0), math.pi)
     for shape in (
-        EllipticCylinder(3.0), EllipticCylinder(3.0, 2.0, position=(0, 0, 5.0), rotation=upright),
-        Ellipsoid(2.0, rotation=TILT), Ellipsoid((2.0, 2.0, 1.0), rotation=0.7),
-        BulgedTube(1.0, 0.0, 3.0), NarrowedTube(1.0, 0.0, 3.0),
-    ):  # fmt: skip
+        EllipticCylinder(3.0),
+        EllipticCylinder(3.0, 2.0, position=(0, 0, 5.0), rotation=upright),
+        Ellipsoid(2.0, rotation=TILT),
+        Ellipsoid((2.0, 2.0, 1.0), rotation=0.7),
+        BulgedTube(1.0, 0.0, 3.0),
+        NarrowedTube(1.0, 0.0, 3.0),
+    ):
         assert shape.rotationally_symmetric, shape
     for shape in (
-        EllipticCylinder(3.0, position=(1.0, 0, 0)), EllipticCylinder((3.0, 3.1)), EllipticCylinder(3.0, rotation=TILT),
-        Ellipsoid((2.0, 2.1, 1.0)), Ellipsoid((2.0, 2.0, 1.0), rotation=TILT), BulgedTube(1.0, 0.1, 3.0), Box(1.0),
-    ):  # fmt: skip
+        EllipticCylinder(3.0, position=(1.0, 0, 0)),
+        EllipticCylinder((3.0, 3.1)),
+        EllipticCylinder(3.0, rotation=TILT),
+        Ellipsoid((2.0, 2.1, 1.0)),
+        Ellipsoid((2.0, 2.0, 1.0), rotation=TILT),
+        BulgedTube(1.0, 0.1, 3.0),
+        Box(1.0),
+    ):
         assert not shape.rotationally_symmetric, shape
 
 
@@ -144,17 +160,27 @@ def test_overlaps_are_refused():
 
     outer = Body("outer", EllipticCylinder(10.0), "water")
     ball = Body("ball", Ellipsoid(2.0, position=(7.0, 0, 0)), "air", "outer")
-    touching, short = Box(1.0, position=(4.0, 0.0, 0.0)), Body("short", EllipticCylinder(5.0, 5.0), "water")
+    touching, short = (
+        Box(1.0, position=(4.0, 0.0, 0.0)),
+        Body("short", EllipticCylinder(5.0, 5.0), "water"),
+    )
     Scene([outer, ball])
     assert len(inside(touching, ball)) == 3
     inside(touching, ball, motion=SinusoidalMotion("outer", 50.0))  # all move together
     refused(
         ("'new' leaves its parent 'outer'", lambda: inside(Ellipsoid(2.0, position=(8.1, 0, 0)))),
         ("'new' and 'ball' overlap", lambda: inside(Box(1.0, position=(5.0, 0.0, 0.0)), ball)),
-        ("overlap", lambda: inside(Ellipsoid(0.1, position=(7.0, 0, 0)), ball)),  # one swallows the other
+        # one swallows the other
+        ("overlap", lambda: inside(Ellipsoid(0.1, position=(7.0, 0, 0)), ball)),
         ("overlap", lambda: inside(ball.shape, ball)),
-        ("leaves its parent", lambda: Scene([short, Body("long", EllipticCylinder(1.0), "air", "short")])),
-        ("'ball' leaves its parent 'outer'", lambda: Scene([outer, ball], SinusoidalMotion("ball", 1.5))),
+        (
+            "leaves its parent",
+            lambda: Scene([short, Body("long", EllipticCylinder(1.0), "air", "short")]),
+        ),
+        (
+            "'ball' leaves its parent 'outer'",
+            lambda: Scene([outer, ball], SinusoidalMotion("ball", 1.5)),
+        ),
         ("overlap", lambda: inside(touching, ball, motion=SinusoidalMotion("ball", 0.5))),
     )
 
@@ -167,9 +193,13 @@ def test_tree():
     energies = np.array([40.0, 64.0, 80.0])
     contrast = scene.contrast(energies)
     assert contrast.shape == (4, 3)
-    expected = MATERIALS["necrotic_core"].attenuation(energies) - MATERIALS["water"].attenuation(energies)
+    expected = MATERIALS["necrotic_core"].attenuation(energies) - MATERIALS["water"].attenuation(
+        energies
+    )
     np.testing.assert_allclose(contrast[2], expected, rtol=1e-14)
-    np.testing.assert_allclose(contrast[0], MATERIALS["pericoronary_fat"].attenuation(energies), rtol=1e-14)
+    np.testing.assert_allclose(
+        contrast[0], MATERIALS["pericoronary_fat"].attenuation(energies), rtol=1e-14
+    )
     other = scene.replace_material("core", "air")
     assert other.materials[2].name == "air"
     assert scene.materials[2].name == "necrotic_core"
@@ -180,7 +210,8 @@ def test_tree():
 
 
 def test_line_integral_is_the_sum_over_labels():
-    """Chord times contrast, summed over bodies, equals the integral of the labelled materials along the ray."""
+    """Chord times contrast, summed over bodies, equals the integral of the labelled materials
+    along the ray."""
     scene = nested()
     energy = np.array([60.0])
     mu = np.array([m.attenuation(energy)[0] for m in scene.materials] + [0.0])
@@ -214,11 +245,16 @@ def test_motion():
     still = nested().with_motion(SinusoidalMotion("ball", 0.0))
     assert still.is_static
     assert not still.moving.any()
-    np.testing.assert_allclose(scene.bounding_box("core"), [[2.5, -2.5, -1.0], [5.5, 4.5, 2.0]], atol=1e-12)
+    np.testing.assert_allclose(
+        scene.bounding_box("core"), [[2.5, -2.5, -1.0], [5.5, 4.5, 2.0]], atol=1e-12
+    )
 
 
 def test_motions_add():
-    moves = [SinusoidalMotion("ball", 1.0), SinusoidalMotion("core", 0.5, rate_bpm=120.0, direction=math.pi / 2)]
+    moves = [
+        SinusoidalMotion("ball", 1.0),
+        SinusoidalMotion("core", 0.5, rate_bpm=120.0, direction=math.pi / 2),
+    ]
     scene = nested().with_motion(moves)
     t = np.array([0.1, 0.2])
     offsets = scene.offsets(t)
@@ -228,7 +264,13 @@ def test_motions_add():
 
 def test_labels():
     scene = nested()
-    points = [(4.0, 1.0, 0.5), (3.0, -3.0, 0.0), (-8.0, 1.9, 0.0), (0.0, 15.0, 99.0), (0.0, 21.0, 0.0)]
+    points = [
+        (4.0, 1.0, 0.5),
+        (3.0, -3.0, 0.0),
+        (-8.0, 1.9, 0.0),
+        (0.0, 15.0, 99.0),
+        (0.0, 21.0, 0.0),
+    ]
     assert scene.labels(points).tolist() == [2, 1, 3, 0, -1]
     grid = VolumeGrid((3, 5, 7), (1.0, 2.0, 3.0), (0.5, -1.0, 2.0))
     labels = scene.labels(grid)
@@ -249,17 +291,23 @@ def test_volume_fractions():
     assert volumes[1:] == pytest.approx([ball - core, core, box], rel=3e-4)
     assert volumes[0] == pytest.approx(math.pi * 20.0**2 * 12.0 - ball - box, rel=1e-4)
     # Voxels whose label is the same at a fine scale are filled by that body alone.
-    core_voxel = tuple(round(v) for v in ((0.5 + 5.75) / 0.5, (1.0 + 22.25) / 0.5, (4.0 + 22.25) / 0.5))
+    core_voxel = tuple(
+        round(v) for v in ((0.5 + 5.75) / 0.5, (1.0 + 22.25) / 0.5, (4.0 + 22.25) / 0.5)
+    )
     assert fractions[(2, *core_voxel)] == pytest.approx(1.0)
     # Against brute force on a few voxel rows.
     fine = VolumeGrid((24, 90 * 1, 90), 0.5)
     sub = (np.arange(8) + 0.5) / 8 - 0.5
     z, y, x = fine.axes
     k, j = 13, 46
-    zz, yy, xx = np.meshgrid(z[k] + 0.5 * sub, y[j] + 0.5 * sub, (x[:, None] + 0.5 * sub).ravel(), indexing="ij")
+    zz, yy, xx = np.meshgrid(
+        z[k] + 0.5 * sub, y[j] + 0.5 * sub, (x[:, None] + 0.5 * sub).ravel(), indexing="ij"
+    )
     labels = scene.labels(np.stack([xx, yy, zz], axis=-1)).reshape(8, 8, 90, 8)
     for body in range(4):
-        np.testing.assert_allclose(fractions[body, k, j], (labels == body).mean(axis=(0, 1, 3)), atol=0.05)
+        np.testing.assert_allclose(
+            fractions[body, k, j], (labels == body).mean(axis=(0, 1, 3)), atol=0.05
+        )
 
 
 def test_volume_fractions_converge_and_2d_is_the_middle_plane():
@@ -274,7 +322,9 @@ def test_volume_fractions_converge_and_2d_is_the_middle_plane():
 def test_render():
     scene = nested()
     grid = VolumeGrid((1, 90, 90), 0.5)
-    image = scene.render(grid, {"outer": -100.0, "ball": 0.0, "core": 40.0, "box": 1000.0}, outside=-1000.0)
+    image = scene.render(
+        grid, {"outer": -100.0, "ball": 0.0, "core": 40.0, "box": 1000.0}, outside=-1000.0
+    )
     assert image.shape == grid.shape
     assert (image.min(), image.max()) == pytest.approx((-1000.0, 1000.0))
     mu = scene.material_map(grid, 60.0)
@@ -286,6 +336,9 @@ def test_ctdi():
     scene = ctdi()
     assert scene.names == ("phantom", *CTDI_HOLES)
     assert [m.name for m in scene.materials[:2]] == ["pmma", "water"]
-    assert [s.position for s in scene.shapes[2:4]] == [(150.0, 0.0, 0.0), pytest.approx((0.0, 150.0, 0.0))]
+    assert [s.position for s in scene.shapes[2:4]] == [
+        (150.0, 0.0, 0.0),
+        pytest.approx((0.0, 150.0, 0.0)),
+    ]
     lengths = chord_lengths(scene, (-626.0, 0.0, 0.0), (1.0, 0.0, 0.0))[:, 0]
     assert lengths == pytest.approx([320.0, 13.0, 13.0, 0.0, 13.0, 0.0], abs=1e-9)

@@ -29,7 +29,9 @@ def test_adult_dimensions(scene):
     heart = box(scene, "heart")
     assert heart.mean(0) == pytest.approx((0.0, 0.0), abs=1e-9)
     assert 100.0 < (heart[1] - heart[0])[0] < 120.0
-    assert len([n for n in scene.names if n.startswith("rib_") and not n.endswith("marrow")]) == 2 * len(RIB_ANGLES_DEG)
+    assert len(
+        [n for n in scene.names if n.startswith("rib_") and not n.endswith("marrow")]
+    ) == 2 * len(RIB_ANGLES_DEG)
 
 
 def test_ribs_are_mirror_images(scene):
@@ -42,12 +44,19 @@ def test_ribs_are_mirror_images(scene):
 
 def test_tissue_areas_of_a_slice(scene):
     grid = VolumeGrid((1, 250, 360), 1.0, (0.0, -34.0, -14.0))
-    fractions = dict(zip(scene.names, scene.volume_fractions(grid).sum((1, 2, 3)) / 100.0, strict=True))  # cm²
+    # cm²
+    fractions = dict(
+        zip(scene.names, scene.volume_fractions(grid).sum((1, 2, 3)) / 100.0, strict=True)
+    )
     assert sum(fractions.values()) == pytest.approx(math.pi * 17.0 * 11.8, rel=1e-3)
     assert 180.0 < fractions["lungs"] < 280.0
-    chambers = sum(fractions[n] for n in ("left_ventricle", "right_ventricle", "left_atrium", "right_atrium"))
+    chambers = sum(
+        fractions[n] for n in ("left_ventricle", "right_ventricle", "left_atrium", "right_atrium")
+    )
     assert 50.0 < fractions["heart"] + chambers < 80.0
-    bone = sum(v for n, v in fractions.items() if n.startswith(("rib", "vertebra", "sternum", "arch")))
+    bone = sum(
+        v for n, v in fractions.items() if n.startswith(("rib", "vertebra", "sternum", "arch"))
+    )
     assert 20.0 < bone < 45.0
 
 

@@ -61,7 +61,11 @@ def test_expected_counts_are_the_sum_over_the_spectrum(model):
 def test_air_is_the_scanners():
     scanner = presets.pcct(mode="spectral", columns=40, rows=4)
     model = SpectralModel.of(scanner, 0.35)
-    air = scanner.weights()[1].sum(-1)[:, None] * scanner.row_factor[:, None] * scanner.mas_per_view(0.35)
+    air = (
+        scanner.weights()[1].sum(-1)[:, None]
+        * scanner.row_factor[:, None]
+        * scanner.mas_per_view(0.35)
+    )
     np.testing.assert_allclose(model.air, air, rtol=1e-9)
     assert (model.bins, model.columns) == (8, 40)
 
@@ -69,7 +73,9 @@ def test_air_is_the_scanners():
 def test_noise_free_counts_give_the_exact_lengths(model):
     a = random_lengths(500, 2)
     counts = model.expected(a, columns=np.arange(500) % 4)
-    found = decompose(counts, model, columns=np.arange(500) % 4, bias_reduction=False, tolerance=1e-7)
+    found = decompose(
+        counts, model, columns=np.arange(500) % 4, bias_reduction=False, tolerance=1e-7
+    )
     assert found.converged.all()
     assert not found.at_bound.any()
     assert (found.line_integrals - a).abs().max() < 1e-6
@@ -92,12 +98,19 @@ def test_information_is_that_of_the_bound(model):
 
 @pytest.mark.parametrize(
     ("exposure_s", "lengths", "seed"),
-    [(2.0, BEHIND_24_CM_FAT, 1), (2.8, BEHIND_24_CM_FAT, 2), (0.35, (116.0, 2.8), 3), (2.0, (0.0, 0.0), 4)],
+    [
+        (2.0, BEHIND_24_CM_FAT, 1),
+        (2.8, BEHIND_24_CM_FAT, 2),
+        (0.35, (116.0, 2.8), 3),
+        (2.0, (0.0, 0.0), 4),
+    ],
 )
 def test_variance_reaches_the_cramer_rao_bound(exposure_s, lengths, seed):
     model, n = model_at(exposure_s), 30000
     a = truth(*lengths)
-    found = decompose(drawn(model.expected(a, columns=[0]), n, seed), model, columns=[0]).line_integrals
+    found = decompose(
+        drawn(model.expected(a, columns=[0]), n, seed), model, columns=[0]
+    ).line_integrals
     bound = cramer_rao(a, model, columns=[0])[:, 0]
     c = torch.cov(found)
     ratio = torch.stack([c[0, 0], c[0, 1], c[1, 1]]) / bound
@@ -108,13 +121,17 @@ def test_variance_reaches_the_cramer_rao_bound(exposure_s, lengths, seed):
 
 
 def test_lowest_exposure_reaches_the_bound_that_can_be_reached():
-    # 112 counts in 8 bins: 4–6 % above Cramér–Rao. Bhattacharyya's bound says how much of that is nobody's fault.
+    # 112 counts in 8 bins: 4–6 % above Cramér–Rao. Bhattacharyya's bound says how much of that is
+    # nobody's fault.
     model, n = model_at(0.35), 60000
     a = truth(*BEHIND_24_CM_FAT)
     counts = drawn(model.expected(a, columns=[0]), n, 5)
     first, second = (cramer_rao(a, model, columns=[0], order=k)[:, 0] for k in (1, 2))
     assert (second[[0, 2]] >= first[[0, 2]]).all()
-    corrected, plain = (decompose(counts, model, columns=[0], bias_reduction=b).line_integrals for b in (True, False))
+    corrected, plain = (
+        decompose(counts, model, columns=[0], bias_reduction=b).line_integrals
+        for b in (True, False)
+    )
     variance = corrected.var(1)
     assert (variance / second[[0, 2]]).max() < 1.05
     assert (variance / first[[0, 2]]).max() < 1.08
@@ -139,7 +156,8 @@ def test_second_order_bound_tends_to_the_first():
 def test_any_counts_give_finite_bounded_lengths(model, bias_reduction):
     rng = np.random.default_rng(6)
     level = 10.0 ** rng.uniform(-3, 4.5, (1, 1500))
-    counts = rng.poisson(level * rng.dirichlet(np.full(8, 0.3), 1500).T).astype(np.float64)  # no spectrum at all
+    # no spectrum at all
+    counts = rng.poisson(level * rng.dirichlet(np.full(8, 0.3), 1500).T).astype(np.float64)
     counts[:, :3] = 0
     counts[:, 3:11] = 500 * np.eye(8)
     counts[:, 11] = model.air[:, 0, 0]
@@ -147,7 +165,10 @@ def test_any_counts_give_finite_bounded_lengths(model, bias_reduction):
     counts[:, 13] = 1e30
     for dtype in (torch.float32, torch.float64):
         found = decompose(
-            torch.from_numpy(counts).to(dtype), model, columns=np.arange(1500) % 4, bias_reduction=bias_reduction
+            torch.from_numpy(counts).to(dtype),
+            model,
+            columns=np.arange(1500) % 4,
+            bias_reduction=bias_reduction,
         )
         for values in (found.line_integrals, found.information):
             assert values.dtype == dtype
@@ -165,7 +186,9 @@ def test_starved_rays_converge(model):
     lengths = torch.from_numpy(np.outer(model.basis.coefficients("water"), rng.uniform(0, 600, n)))
     columns, scale = rng.integers(0, 4, n), 10.0 ** rng.uniform(-6, 0, n)
     counts = torch.from_numpy(
-        rng.poisson(model.expected(lengths, columns=columns, scale=scale).numpy()).astype(np.float64)
+        rng.poisson(model.expected(lengths, columns=columns, scale=scale).numpy()).astype(
+            np.float64
+        )
     )
     found = decompose(counts, model, columns=columns, scale=scale)
     assert (counts.sum(0) == 0).sum() > 1000
@@ -190,7 +213,9 @@ def test_scan_of_a_polyethylene_rod():
     assert error[..., inner].abs().max() < 0.01  # of 40 mm; the finite cell and focal spot
     found = decompose_scan(scan.with_noise(0.35, 3), SpectralModel.of(scanner, 0.35))
     assert found.line_integrals.dtype == torch.float32
-    assert (found.line_integrals - error.new_tensor(np.stack([chord, 0 * chord]))[:, None, None]).abs().mean() < 5
+    assert (
+        found.line_integrals - error.new_tensor(np.stack([chord, 0 * chord]))[:, None, None]
+    ).abs().mean() < 5
 
 
 def test_windowed_scan():
@@ -205,7 +230,9 @@ def test_windowed_scan():
     with pytest.raises(ValueError, match="air counts of scan and model differ"):
         decompose_scan(scan, SpectralModel.of(scanner, 0.7))
     with pytest.raises(ValueError, match="build the model from the scanner"):
-        decompose_scan(scan, SpectralModel.of(presets.pcct(6, "spectral", columns=100, rows=2), 0.35))
+        decompose_scan(
+            scan, SpectralModel.of(presets.pcct(6, "spectral", columns=100, rows=2), 0.35)
+        )
 
 
 def test_errors(model):
@@ -238,7 +265,13 @@ def test_another_basis(model):
     basis = Basis(material("water"), material("hydroxyapatite"))
     other = SpectralModel(model.energies, model.spectra, basis=basis)
     a = truth(200.0, 5.0, 30.0, 0.0)
-    found = decompose(other.expected(a, columns=[0, 2]), other, columns=[0, 2], bias_reduction=False, tolerance=1e-7)
+    found = decompose(
+        other.expected(a, columns=[0, 2]),
+        other,
+        columns=[0, 2],
+        bias_reduction=False,
+        tolerance=1e-7,
+    )
     torch.testing.assert_close(found.line_integrals, a, rtol=0, atol=1e-6)
 
 
@@ -248,7 +281,8 @@ def test_empty_input(model):
 
 
 def two_bins(low, high):
-    """A model of one column and two bins, which differ in energy and expect so many photons in air."""
+    """A model of one column and two bins, which differ in energy and expect so many photons in
+    air."""
     energies = np.linspace(30.0, 90.0, 7)
     shape = np.array([[4, 3, 2, 1, 0, 0, 0], [0, 0, 0, 1, 2, 3, 4]]) / 10.0
     return SpectralModel(energies, shape[None] * np.array([low, high])[:, None])

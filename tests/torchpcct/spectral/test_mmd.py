@@ -21,9 +21,12 @@ def test_pure_tissues():
 
 @pytest.mark.parametrize("triplet", [(0, 1, 2), (0, 1, 3), (1, 2, 3)])
 def test_exact_mixtures_return_their_fractions(triplet):
-    # The core lies inside the triangle of the other three, so mixtures of the core with two others are unique.
+    # The core lies inside the triangle of the other three, so mixtures of the core with two others
+    # are unique.
     exact = torch.zeros(4, 200, dtype=torch.float64)
-    exact[list(triplet)] = torch.from_numpy(np.random.default_rng(sum(triplet)).dirichlet(np.ones(3), 200).T.copy())
+    exact[list(triplet)] = torch.from_numpy(
+        np.random.default_rng(sum(triplet)).dirichlet(np.ones(3), 200).T.copy()
+    )
     torch.testing.assert_close(mmd(CORNERS @ exact, BASIS), exact, rtol=0, atol=1e-6)
 
 
@@ -53,7 +56,9 @@ def test_fractions_are_fractions_and_nearest(seed, correlated):
 
 
 def test_smallest_triangle_explains_where_several_hold():
-    square = torch.tensor([[0.0, 1.0, 1.0, 0.0, 0.5], [0.0, 0.0, 1.0, 1.0, 0.4]], dtype=torch.float64)
+    square = torch.tensor(
+        [[0.0, 1.0, 1.0, 0.0, 0.5], [0.0, 0.0, 1.0, 1.0, 0.4]], dtype=torch.float64
+    )
     x = torch.tensor([[0.5], [0.2]], dtype=torch.float64)
     fractions = mmd(x, BASIS, square)[:, 0]
     torch.testing.assert_close(fractions, torch.tensor([0.25, 0.25, 0, 0, 0.5]).double())
@@ -81,7 +86,9 @@ def test_cleaning_loses_the_core_as_noise_grows():
     truth = phantom()
     rng = np.random.default_rng(3)
     c = np.array([[4e-4, -1.35e-4], [-1.35e-4, 5e-5]])
-    noise = torch.from_numpy(rng.multivariate_normal([0, 0], c, truth.numel()).T).reshape(2, *truth.shape)
+    noise = torch.from_numpy(rng.multivariate_normal([0, 0], c, truth.numel()).T).reshape(
+        2, *truth.shape
+    )
     images = CORNERS[:, truth]
     scores = []
     for share in (0.0, 0.25, 0.5, 1.0):
@@ -113,11 +120,15 @@ def test_cleaning_keeps_pure_labels_and_repeats():
 
 
 def test_nearest_finds_what_the_largest_fraction_loses():
-    """Core and fibrous tissue 4 standard deviations apart, on one line with fat: errors as of a threshold between."""
+    """Core and fibrous tissue 4 standard deviations apart, on one line with fat: errors as of a
+    threshold between."""
     truth = torch.tensor([1, 2, 3]).repeat(4000)
-    c = np.array([[0.0440, -0.0145], [-0.0145, 0.0053]]) / 16  # a quarter of the noise of the paper's tables
+    # a quarter of the noise of the paper's tables
+    c = np.array([[0.0440, -0.0145], [-0.0145, 0.0053]]) / 16
     noise = np.random.default_rng(5).multivariate_normal([0, 0], c, truth.numel()).T
-    fractions = mmd(CORNERS[:, truth] + torch.from_numpy(noise), BASIS, covariance=(c[0, 0], c[0, 1], c[1, 1]))
+    fractions = mmd(
+        CORNERS[:, truth] + torch.from_numpy(noise), BASIS, covariance=(c[0, 0], c[0, 1], c[1, 1])
+    )
     found = nearest(fractions, BASIS, covariance=(c[0, 0], c[0, 1], c[1, 1]))
     assert found.dtype == torch.int64
     wrong = float((found != truth).double().mean())

@@ -1,4 +1,5 @@
-"""Virtual monochromatic images: water at 0 HU, noise, the optimum energy; basis materials and their coefficients."""
+"""Virtual monochromatic images: water at 0 HU, noise, the optimum energy; basis materials and
+their coefficients."""
 
 import numpy as np
 import pytest
@@ -34,11 +35,14 @@ def test_water_is_zero_at_every_energy():
 
 
 def test_air_is_minus_thousand():
-    assert (vmi(torch.zeros(2, 4), pe_pvc(), ENERGIES) + 1000).abs().max() < 2  # air itself is 1.2 HU above vacuum
+    # air itself is 1.2 HU above vacuum
+    assert (vmi(torch.zeros(2, 4), pe_pvc(), ENERGIES) + 1000).abs().max() < 2
     assert (vmi(image_of("air"), pe_pvc(), ENERGIES) + 1000).abs().max() < 0.1
 
 
-@pytest.mark.parametrize(("name", "tolerance"), [("fibrous_tissue", 0.6), ("necrotic_core", 0.6), ("adipose", 0.8)])
+@pytest.mark.parametrize(
+    ("name", "tolerance"), [("fibrous_tissue", 0.6), ("necrotic_core", 0.6), ("adipose", 0.8)]
+)
 def test_tissues_read_their_exact_hu(name, tolerance):
     hu = vmi(image_of(name), pe_pvc(), ENERGIES)[:, 0, 0].numpy()
     water, air = (material(n).attenuation(ENERGIES) for n in ("water", "air"))
@@ -47,7 +51,8 @@ def test_tissues_read_their_exact_hu(name, tolerance):
 
 
 def test_water_decomposed_from_its_counts_is_zero():
-    # True water, with all that the basis cannot express, behind 5…35 cm: the whole chain, at every energy.
+    # True water, with all that the basis cannot express, behind 5…35 cm: the whole chain, at every
+    # energy.
     energies, weights = presets.pcct(mode="spectral").weights()
     model = SpectralModel(energies, weights[:, (750, 1300), :].swapaxes(0, 1))
     t = np.linspace(50.0, 350.0, 14)
@@ -69,7 +74,9 @@ def test_noise_follows_from_the_covariance():
     torch.testing.assert_close(vmi(images, pe_pvc(), ENERGIES).std(1), exact, rtol=0.02, atol=0)
     # The same from the propagated samples, exactly.
     propagated = vmi_noise(np.cov(images.numpy())[(0, 0, 1), (0, 1, 1)], pe_pvc(), ENERGIES)
-    torch.testing.assert_close(propagated, vmi(images, pe_pvc(), ENERGIES).std(1), rtol=1e-9, atol=0)
+    torch.testing.assert_close(
+        propagated, vmi(images, pe_pvc(), ENERGIES).std(1), rtol=1e-9, atol=0
+    )
 
 
 def test_curve_and_its_optimum():
@@ -78,7 +85,9 @@ def test_curve_and_its_optimum():
     # Noise of the projections behind 24 cm of fat: the images' has the same shape.
     energies, weights = presets.pcct(mode="spectral").weights()
     model = SpectralModel(energies, weights[:, 750:751, :].swapaxes(0, 1))
-    covariance = cramer_rao(torch.tensor([[231.7], [5.6]], dtype=torch.float64), model)[:, 0].numpy()
+    covariance = cramer_rao(torch.tensor([[231.7], [5.6]], dtype=torch.float64), model)[
+        :, 0
+    ].numpy()
     curve = vmi_curve(fibrous, core, covariance, basis, np.arange(40.0, 141.0))
     assert (curve.contrast > 0).all()
     assert (curve.cnr <= curve.limit * (1 + 1e-12)).all()
@@ -153,7 +162,13 @@ def test_attenuation_of_coefficients():
 
 @pytest.mark.parametrize(
     ("name", "largest_hu"),
-    [("water", 0.4), ("pericoronary_fat", 0.2), ("necrotic_core", 0.4), ("fibrous_tissue", 0.4), ("blood_iodine", 60)],
+    [
+        ("water", 0.4),
+        ("pericoronary_fat", 0.2),
+        ("necrotic_core", 0.4),
+        ("fibrous_tissue", 0.4),
+        ("blood_iodine", 60),
+    ],
 )
 def test_tissues_lie_in_the_basis(name, largest_hu):
     error = np.abs(pe_pvc().residual(name))
@@ -165,7 +180,10 @@ def test_errors_of_a_basis():
     basis = pe_pvc()
     refused(
         ("Material", lambda: Basis("polyethylene", MATERIALS["pvc"])),
-        ("attenuate alike", lambda: Basis(MATERIALS["water"], MATERIALS["water"].with_density(2.0))),
+        (
+            "attenuate alike",
+            lambda: Basis(MATERIALS["water"], MATERIALS["water"].with_density(2.0)),
+        ),
         ("weights", lambda: basis.coefficients("water", [60.0])),
         ("weights", lambda: basis.coefficients("water", KEV, -1.0)),
         ("2 entries", lambda: basis.mu((1, 2, 3), 60.0)),

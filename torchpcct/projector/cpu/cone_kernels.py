@@ -1,14 +1,15 @@
 # mypy: disable-error-code="assignment, call-arg"
 """CPU kernels of the cone beam: distance-driven overlaps, followed slab by slab, z innermost.
 
-Model (De Man and Basu 2004, Phys. Med. Biol. 49:2463, in its separable form). In each slab of voxels (a grid row or
-column, whichever the ray crosses more often) the edges of a detector cell are projected onto the slab's middle plane.
-The reading is the mean of the voxel values over that rectangle, times the path through the slab, summed over slabs.
-In the plane the overlaps are written out; along z they are differences of a running sum, read at the projected row
-edges by linear interpolation, which is the same overlap.
+Model (De Man and Basu 2004, Phys. Med. Biol. 49:2463, in its separable form). In each slab of
+voxels (a grid row or column, whichever the ray crosses more often) the edges of a detector cell are
+projected onto the slab's middle plane. The reading is the mean of the voxel values over that
+rectangle, times the path through the slab, summed over slabs. In the plane the overlaps are written
+out; along z they are differences of a running sum, read at the projected row edges by linear
+interpolation, which is the same overlap.
 
-Forward runs in parallel over views, the adjoint over slabs: no two threads write to one place and every sum has a
-fixed order, so that results do not depend on the number of threads.
+Forward runs in parallel over views, the adjoint over slabs: no two threads write to one place and
+every sum has a fixed order, so that results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -28,17 +29,24 @@ __all__ = ["backproject", "padded", "project", "tabulate_cells"]
 
 # NaN and Inf must survive, so only the flags that leave them alone.
 _FLAGS = {"contract", "nsz", "arcp", "reassoc"}
-# Slabs farther apart than this part of a layer are interpolated one by one (see tables.layer_spacing).
+# Slabs farther apart than this part of a layer are interpolated one by one (see
+# tables.layer_spacing).
 MAX_LAYERS_PER_SLAB = 0.4
 # Slabs closer to the source than this part of the source-detector distance are behind it.
 NEAREST = 1e-6
-# Slabs of one task of the adjoint: enough to reuse a layer, few enough to share the work. Fixed, for determinism.
+# Slabs of one task of the adjoint: enough to reuse a layer, few enough to share the work. Fixed,
+# for determinism.
 SLAB_BLOCK = 24
-# Of functions that only kernels call. Without wrappers for Python and C they compile faster. Inlined they exist once,
-# in the kernel: of one that is called, a fresh process and one that reads the cache have copies that round differently.
+# Of functions that only kernels call. Without wrappers for Python and C they compile faster.
+# Inlined they exist once, in the kernel: of one that is called, a fresh process and one that reads
+# the cache have copies that round differently.
 INNER: Any = {
-    "cache": True, "forceinline": True, "error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True,
-}  # fmt: skip
+    "cache": True,
+    "forceinline": True,
+    "error_model": "numpy",
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+}
 # Ray geometry in float64, called per cell and not per voxel.
 _small = njit(**INNER, fastmath=_FLAGS)
 _kernel = njit(nogil=True, cache=True, fastmath=_FLAGS, error_model="numpy")
@@ -51,7 +59,8 @@ def padded(n: int) -> int:
 
 @_small
 def _edge_line(pose, table, j, axis, lattice, parallel):
-    """In-slab coordinate of a ray, ``t(r) = p + q r``: r counts slabs, t voxel edges along the slab."""
+    """In-slab coordinate of a ray, ``t(r) = p + q r``: r counts slabs, t voxel edges along the
+    slab."""
     a, b = table[j, 0], table[j, 1]
     if parallel:
         sx, sy = pose[0] + b * pose[5], pose[1] + b * pose[6]
@@ -59,17 +68,23 @@ def _edge_line(pose, table, j, axis, lattice, parallel):
     else:
         sx, sy = pose[0], pose[1]
         dx, dy = a * pose[3] + b * pose[5], a * pose[4] + b * pose[6]
-    # lattice: y of slab row 0, its pitch, x of the first voxel edge, its pitch; then the same for slab columns.
+    # lattice: y of slab row 0, its pitch, x of the first voxel edge, its pitch; then the same for
+    # slab columns.
     if axis == 0:
         slope = dx / dy
-        return (sx - lattice[2] + (lattice[0] - sy) * slope) / lattice[3], slope * lattice[1] / lattice[3]
+        return (sx - lattice[2] + (lattice[0] - sy) * slope) / lattice[3], slope * lattice[
+            1
+        ] / lattice[3]
     slope = dy / dx
-    return (sy - lattice[6] + (lattice[4] - sx) * slope) / lattice[7], slope * lattice[5] / lattice[7]
+    return (sy - lattice[6] + (lattice[4] - sx) * slope) / lattice[7], slope * lattice[5] / lattice[
+        7
+    ]
 
 
 @_small
 def _depth_line(pose, table, j, axis, lattice, parallel):
-    """Ray parameter at the slabs, ``λ(r) = l + m r``, the path per slab, and the squared in-plane ray length."""
+    """Ray parameter at the slabs, ``λ(r) = l + m r``, the path per slab, and the squared
+    in-plane ray length."""
     a, b = table[j, 0], table[j, 1]
     if parallel:
         dx, dy = pose[3], pose[4]
@@ -77,8 +92,18 @@ def _depth_line(pose, table, j, axis, lattice, parallel):
         dx, dy = a * pose[3] + b * pose[5], a * pose[4] + b * pose[6]
     square = dx * dx + dy * dy
     if axis == 0:
-        return ((lattice[0] - pose[1]) / dy, lattice[1] / dy, lattice[1] * math.sqrt(square) / abs(dy), square)
-    return ((lattice[4] - pose[0]) / dx, lattice[5] / dx, lattice[5] * math.sqrt(square) / abs(dx), square)
+        return (
+            (lattice[0] - pose[1]) / dy,
+            lattice[1] / dy,
+            lattice[1] * math.sqrt(square) / abs(dy),
+            square,
+        )
+    return (
+        (lattice[4] - pose[0]) / dx,
+        lattice[5] / dx,
+        lattice[5] * math.sqrt(square) / abs(dx),
+        square,
+    )
 
 
 @_small
@@ -92,9 +117,11 @@ def _cell(pose, edges, centers, j, axis, lattice):
 
 @_kernel
 def tabulate_cells(segments, pose, edges, centers, first, lattice, parallel, cells, axes):
-    """Per view and column ``p0, q0, p1, q1, l0, l1, path, square`` into ``cells``, and the main axis into ``axes``.
+    """Per view and column ``p0, q0, p1, q1, l0, l1, path, square`` into ``cells``, and the main
+    axis into ``axes``.
 
-    The lines of the cell's two edges (see ``_edge_line``) and of its depth (see ``_depth_line``), of any beam.
+    The lines of the cell's two edges (see ``_edge_line``) and of its depth (see ``_depth_line``),
+    of any beam.
     """
     for s in range(segments.shape[0]):
         v, axis, start, count = segments[s]
@@ -102,7 +129,9 @@ def tabulate_cells(segments, pose, edges, centers, first, lattice, parallel, cel
             k, cell = first[v] + j, cells[v, j]
             cell[0], cell[1] = _edge_line(pose[v], edges, k, axis, lattice, parallel)
             cell[2], cell[3] = _edge_line(pose[v], edges, k + 1, axis, lattice, parallel)
-            cell[4], cell[5], cell[6], cell[7] = _depth_line(pose[v], centers, k, axis, lattice, parallel)
+            cell[4], cell[5], cell[6], cell[7] = _depth_line(
+                pose[v], centers, k, axis, lattice, parallel
+            )
             axes[v, j] = axis
 
 
@@ -111,7 +140,11 @@ def _with_room(room, offset, low, high):
     """The entries' arrays, or larger ones."""
     if room <= offset.size:
         return offset, low, high
-    return np.empty(room, dtype=np.int64), np.empty(room, dtype=low.dtype), np.empty(room, dtype=low.dtype)
+    return (
+        np.empty(room, dtype=np.int64),
+        np.empty(room, dtype=low.dtype),
+        np.empty(room, dtype=low.dtype),
+    )
 
 
 @_small
@@ -122,18 +155,41 @@ def _clear(line):
 
 @_small
 def _room(p0, q0, p1, q1, r0, r1, width):
-    """Entries that ``_plan`` may need: the cell's width is largest in the first or the last slab."""
+    """Entries that ``_plan`` may need: the cell's width is largest in the first or the last
+    slab."""
     widest = max(abs(p1 - p0 + (q1 - q0) * r0), abs(p1 - p0 + (q1 - q0) * (r1 - 1)))
     return (r1 - r0) * (int(min(widest, float(width))) + 2)
 
 
 @_small
-def _plan(p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, across, along, layers, ends, offset, low, high):
-    """What one cell reads of the slabs ``r0 … r1``: runs of slabs between the same two layers, and their lines.
+def _plan(
+    p0,
+    q0,
+    p1,
+    q1,
+    l0,
+    l1,
+    path,
+    layer,
+    layered,
+    r0,
+    r1,
+    width,
+    across,
+    along,
+    layers,
+    ends,
+    offset,
+    low,
+    high,
+):
+    """What one cell reads of the slabs ``r0 … r1``: runs of slabs between the same two layers, and
+    their lines.
 
-    Entry e adds line ``offset[e]`` with the weight ``low[e]`` to the run's lower layer and ``high[e]`` to the upper.
-    ``layers`` and ``ends`` receive the lower layer of every run and the end of its entries. Where slabs are
-    interpolated one by one (``layered`` false) a slab is a run, its row is the slab, and all its weight is ``low``.
+    Entry e adds line ``offset[e]`` with the weight ``low[e]`` to the run's lower layer and
+    ``high[e]`` to the upper. ``layers`` and ``ends`` receive the lower layer of every run and the
+    end of its entries. Where slabs are interpolated one by one (``layered`` false) a slab is a run,
+    its row is the slab, and all its weight is ``low``.
 
     Returns:
         the number of runs.
@@ -177,22 +233,44 @@ def _plan(p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, across, a
 
 @_small
 def _add_rows(lanes, line, at, depth, z0, dz, row0, row_pitch, out):
-    """Add the row means of one layer (running sums ``line``) at the ray parameter ``depth`` to ``out``."""
+    """Add the row means of one layer (running sums ``line``) at the ray parameter ``depth`` to
+    ``out``."""
     real = line.dtype.type
     step = depth * row_pitch / dz
     zeta = real((at[2] + depth * (row0 + at[7] - at[2]) - z0) / dz)
-    add_steps(lanes, line, zeta, real(step), line.size - 8, line.size, real(1.0 / step), out, out.size)
+    add_steps(
+        lanes, line, zeta, real(step), line.size - 8, line.size, real(1.0 / step), out, out.size
+    )
 
 
 @_kernel
 def _project(
-    begin, end, lanes, lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch,
-    layer, data,
-):  # fmt: skip
-    """The views ``begin … end``; ``lines``: ``(ny * nx, knots)``, ``data``: ``(views, rows, columns)``."""
+    begin,
+    end,
+    lanes,
+    lines,
+    ny,
+    nx,
+    pose,
+    edges,
+    centers,
+    first,
+    segments,
+    start,
+    lattice,
+    z0,
+    dz,
+    row0,
+    row_pitch,
+    layer,
+    data,
+):
+    """The views ``begin … end``; ``lines``: ``(ny * nx, knots)``, ``data``: ``(views, rows,
+    columns)``."""
     knots = lines.shape[1]
     _, rows, columns = data.shape
-    real, r0 = lines.dtype.type, np.int64(0)  # typed as in the adjoint: else what takes it is compiled for each
+    # typed as in the adjoint: else what takes it is compiled for each
+    real, r0 = lines.dtype.type, np.int64(0)
     flat = lines.reshape(-1)
     pair, slab = np.empty((2, knots), dtype=lines.dtype), np.empty(knots, dtype=lines.dtype)
     sums = np.empty((columns, (rows + 7) // 8 * 8), dtype=lines.dtype)  # padded(rows)
@@ -210,13 +288,34 @@ def _project(
             slabs, width = (ny, nx) if axis == 0 else (nx, ny)
             across, along = (nx * knots, knots) if axis == 0 else (knots, nx * knots)
             for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
-                p0, q0, p1, q1, l0, l1, path, square = _cell(at, edges, centers, first[v] + j, axis, lattice)
+                p0, q0, p1, q1, l0, l1, path, square = _cell(
+                    at, edges, centers, first[v] + j, axis, lattice
+                )
                 layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
-                offset, low, high = _with_room(_room(p0, q0, p1, q1, r0, slabs, width), offset, low, high)
+                offset, low, high = _with_room(
+                    _room(p0, q0, p1, q1, r0, slabs, width), offset, low, high
+                )
                 runs = _plan(
-                    p0, q0, p1, q1, l0, l1, path, layer, layered, r0, slabs, width, across, along, layers, ends, offset,
-                    low, high,
-                )  # fmt: skip
+                    p0,
+                    q0,
+                    p1,
+                    q1,
+                    l0,
+                    l1,
+                    path,
+                    layer,
+                    layered,
+                    r0,
+                    slabs,
+                    width,
+                    across,
+                    along,
+                    layers,
+                    ends,
+                    offset,
+                    low,
+                    high,
+                )
                 e0 = 0
                 for n in range(runs):
                     now, e1 = layers[n], ends[n]
@@ -225,7 +324,18 @@ def _project(
                         _add_rows(lanes, slab, at, l0 + l1 * now, z0, dz, row0, row_pitch, sums[j])
                         e0 = e1
                         continue
-                    add_lines(lanes, flat, offset, low, high, e0, e1, knots, pair[now % 2], pair[(now + 1) % 2])
+                    add_lines(
+                        lanes,
+                        flat,
+                        offset,
+                        low,
+                        high,
+                        e0,
+                        e1,
+                        knots,
+                        pair[now % 2],
+                        pair[(now + 1) % 2],
+                    )
                     e0 = e1
                     after = layers[n + 1] if n + 1 < runs else -9
                     for m in range(now, now + 2):
@@ -241,11 +351,29 @@ def _project(
                 data[v, i, j] = sums[j, i]
 
 
-def project(lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, layer, data):
+def project(
+    lines,
+    ny,
+    nx,
+    pose,
+    edges,
+    centers,
+    first,
+    segments,
+    start,
+    lattice,
+    z0,
+    dz,
+    row0,
+    row_pitch,
+    layer,
+    data,
+):
     """Cone-beam line integrals of one volume.
 
     Args:
-        lines: ``(ny * nx, padded(nz) + 8)`` running sums of the volume along z: 0 first, the total repeated.
+        lines: ``(ny * nx, padded(nz) + 8)`` running sums of the volume along z: 0 first, the total
+            repeated.
         pose, edges, centers, first: see ``rays.Rays``.
         segments, start: see ``rays.Segments``.
         lattice: ``(8,)`` slab positions, see ``_edge_line``.
@@ -256,14 +384,32 @@ def project(lines, ny, nx, pose, edges, centers, first, segments, start, lattice
     """
     lanes = (0,) * (32 // lines.dtype.itemsize)
     run(
-        _project, data.shape[0], lanes, lines, ny, nx, pose, edges, centers, first, segments, start, lattice, z0, dz,
-        row0, row_pitch, layer, data,
-    )  # fmt: skip
+        _project,
+        data.shape[0],
+        lanes,
+        lines,
+        ny,
+        nx,
+        pose,
+        edges,
+        centers,
+        first,
+        segments,
+        start,
+        lattice,
+        z0,
+        dz,
+        row0,
+        row_pitch,
+        layer,
+        data,
+    )
 
 
 @_kernel
 def _row_sums(begin, end, data, pose, centers, first, row0, row_pitch, view0, sums):
-    """Readings times their slant, summed along the rows: ``(views, columns, rows + 1)``, from ``view0`` on."""
+    """Readings times their slant, summed along the rows: ``(views, columns, rows + 1)``, from
+    ``view0`` on."""
     _, columns, edges = sums.shape
     for n in range(begin, end):
         v = view0 + n
@@ -281,7 +427,8 @@ def _row_sums(begin, end, data, pose, centers, first, row0, row_pitch, view0, su
 
 @_small
 def _layer_values(lanes, sums, at, depth, z0, dz, row0, row_pitch, values):
-    """Transpose of ``_add_rows``: what each voxel of a line at ``depth`` collects from the running row sums."""
+    """Transpose of ``_add_rows``: what each voxel of a line at ``depth`` collects from the
+    running row sums."""
     real = sums.dtype.type
     rho = ((z0 - at[2]) / depth - (row0 + at[7] - at[2])) / row_pitch
     pitch = dz / (depth * row_pitch)
@@ -290,10 +437,29 @@ def _layer_values(lanes, sums, at, depth, z0, dz, row0, row_pitch, values):
 
 @_kernel
 def _gather(
-    begin, end, lanes, sums, pose, edges, centers, first, segments, seg0, seg1, view0, lattice, z0, dz, row0,
-    row_pitch, layer, by_row, by_column,
-):  # fmt: skip
-    """Add a chunk of views to ``by_row``, ``(ny, nx, padded(nz))``, and ``by_column``, its transpose, by blocks."""
+    begin,
+    end,
+    lanes,
+    sums,
+    pose,
+    edges,
+    centers,
+    first,
+    segments,
+    seg0,
+    seg1,
+    view0,
+    lattice,
+    z0,
+    dz,
+    row0,
+    row_pitch,
+    layer,
+    by_row,
+    by_column,
+):
+    """Add a chunk of views to ``by_row``, ``(ny, nx, padded(nz))``, and ``by_column``, its
+    transpose, by blocks."""
     row_tasks = (by_row.shape[0] + SLAB_BLOCK - 1) // SLAB_BLOCK
     nz = by_row.shape[2]
     pair = np.empty((2, nz), dtype=sums.dtype)
@@ -302,7 +468,11 @@ def _gather(
     low, high = np.empty(0, dtype=sums.dtype), np.empty(0, dtype=sums.dtype)
     for task in range(begin, end):
         axis = 0 if task < row_tasks else 1
-        out, r0 = (by_row, task * SLAB_BLOCK) if axis == 0 else (by_column, (task - row_tasks) * SLAB_BLOCK)
+        out, r0 = (
+            (by_row, task * SLAB_BLOCK)
+            if axis == 0
+            else (by_column, (task - row_tasks) * SLAB_BLOCK)
+        )
         slabs, width = out.shape[:2]
         r1 = min(r0 + SLAB_BLOCK, slabs)
         flat = out.reshape(-1)
@@ -312,13 +482,34 @@ def _gather(
             v = segments[s, 0]
             at = pose[v]
             for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
-                p0, q0, p1, q1, l0, l1, path, _ = _cell(at, edges, centers, first[v] + j, axis, lattice)
+                p0, q0, p1, q1, l0, l1, path, _ = _cell(
+                    at, edges, centers, first[v] + j, axis, lattice
+                )
                 layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
-                offset, low, high = _with_room(_room(p0, q0, p1, q1, r0, r1, width), offset, low, high)
+                offset, low, high = _with_room(
+                    _room(p0, q0, p1, q1, r0, r1, width), offset, low, high
+                )
                 runs = _plan(
-                    p0, q0, p1, q1, l0, l1, path, layer, layered, r0, r1, width, width * nz, nz, layers, ends, offset,
-                    low, high,
-                )  # fmt: skip
+                    p0,
+                    q0,
+                    p1,
+                    q1,
+                    l0,
+                    l1,
+                    path,
+                    layer,
+                    layered,
+                    r0,
+                    r1,
+                    width,
+                    width * nz,
+                    nz,
+                    layers,
+                    ends,
+                    offset,
+                    low,
+                    high,
+                )
                 e0, before = 0, -9
                 for n in range(runs):
                     now, e1 = layers[n], ends[n]
@@ -326,17 +517,46 @@ def _gather(
                     if layered:
                         for m in range(now, now + 2):
                             if m != before and m != before + 1:
-                                _layer_values(lanes, line, at, m * layer, z0, dz, row0, row_pitch, pair[m % 2])
+                                _layer_values(
+                                    lanes, line, at, m * layer, z0, dz, row0, row_pitch, pair[m % 2]
+                                )
                         before = now
-                        spread_lines(lanes, flat, offset, low, high, e0, e1, nz, pair[now % 2], pair[(now + 1) % 2])
+                        spread_lines(
+                            lanes,
+                            flat,
+                            offset,
+                            low,
+                            high,
+                            e0,
+                            e1,
+                            nz,
+                            pair[now % 2],
+                            pair[(now + 1) % 2],
+                        )
                     else:
-                        _layer_values(lanes, line, at, l0 + l1 * now, z0, dz, row0, row_pitch, pair[0])
+                        _layer_values(
+                            lanes, line, at, l0 + l1 * now, z0, dz, row0, row_pitch, pair[0]
+                        )
                         spread_line(lanes, flat, offset, low, e0, e1, nz, pair[0])
                     e0 = e1
 
 
 def backproject(
-    data, pose, edges, centers, first, segments, start, lattice, z0, dz, row0, row_pitch, layer, chunk, volume
+    data,
+    pose,
+    edges,
+    centers,
+    first,
+    segments,
+    start,
+    lattice,
+    z0,
+    dz,
+    row0,
+    row_pitch,
+    layer,
+    chunk,
+    volume,
 ):
     """The exact transpose of :func:`project`.
 
@@ -356,9 +576,27 @@ def backproject(
         sums = np.empty((after - before, columns, rows + 1), dtype=data.dtype)
         run(_row_sums, after - before, data, pose, centers, first, row0, row_pitch, before, sums)
         run(
-            _gather, tasks, lanes, sums, pose, edges, centers, first, segments, start[before], start[after], before,
-            lattice, z0, dz, row0, row_pitch, layer, by_row, by_column,
-        )  # fmt: skip
+            _gather,
+            tasks,
+            lanes,
+            sums,
+            pose,
+            edges,
+            centers,
+            first,
+            segments,
+            start[before],
+            start[after],
+            before,
+            lattice,
+            z0,
+            dz,
+            row0,
+            row_pitch,
+            layer,
+            by_row,
+            by_column,
+        )
     by_row += by_column.transpose(1, 0, 2)
     volume[...] = by_row[..., :nz].transpose(2, 0, 1)
 

@@ -13,7 +13,8 @@ from torchpcct.threads import get_num_threads
 
 __all__ = ["ConePasses"]
 
-# Row sums of the adjoint are made for chunks of views of about this size: large enough to keep all threads busy.
+# Row sums of the adjoint are made for chunks of views of about this size: large enough to keep all
+# threads busy.
 ROW_SUMS_BYTES = 64 << 20
 
 
@@ -30,9 +31,20 @@ class ConePasses:
         # One volume after the other: each stays in the cache, a batch of them would not.
         for n in range(x.shape[0]):
             project(
-                running_sums(x[n]), ny, nx, t.pose, r.edges, r.centers, r.first, t.segments.table, t.segments.start,
-                t.lattice, *t.heights, t.layer, y[n],
-            )  # fmt: skip
+                running_sums(x[n]),
+                ny,
+                nx,
+                t.pose,
+                r.edges,
+                r.centers,
+                r.first,
+                t.segments.table,
+                t.segments.start,
+                t.lattice,
+                *t.heights,
+                t.layer,
+                y[n],
+            )
         return y
 
     def adjoint(self, y: NDArray) -> NDArray:
@@ -40,19 +52,34 @@ class ConePasses:
         x = np.empty((y.shape[0], *t.grid.shape), dtype=y.dtype)
         for n in range(y.shape[0]):
             backproject(
-                y[n], t.pose, r.edges, r.centers, r.first, t.segments.table, t.segments.start, t.lattice, *t.heights,
-                t.layer, self.views_at_once(y.itemsize), x[n],
-            )  # fmt: skip
+                y[n],
+                t.pose,
+                r.edges,
+                r.centers,
+                r.first,
+                t.segments.table,
+                t.segments.start,
+                t.lattice,
+                *t.heights,
+                t.layer,
+                self.views_at_once(y.itemsize),
+                x[n],
+            )
         return x
 
     def workspace(self, batch: int, itemsize: int) -> int:
-        """Bytes held besides input and output, the larger of the two directions; volumes pass one by one."""
+        """Bytes held besides input and output, the larger of the two directions; volumes pass
+        one by one."""
         forward, adjoint, per_view = self.bytes(itemsize)
         return max(forward, adjoint + per_view * self.views_at_once(itemsize))
 
     def bytes(self, itemsize: int) -> tuple[int, int, int]:
-        """Working memory of the passes of one volume: forward, adjoint, adjoint per view held at a time."""
-        r, table = self.tables.rays, 8 * (8 * self.tables.rays.views + 4 * len(self.tables.segments.table))
+        """Working memory of the passes of one volume: forward, adjoint, adjoint per view held at
+        a time."""
+        r, table = (
+            self.tables.rays,
+            8 * (8 * self.tables.rays.views + 4 * len(self.tables.segments.table)),
+        )
         nz, ny, nx = self.tables.grid.shape
         forward = ny * nx * (nz + 16) + r.columns * padded(r.rows) * get_num_threads()
         return (

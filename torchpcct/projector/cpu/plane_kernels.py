@@ -1,11 +1,13 @@
 # mypy: disable-error-code="assignment, call-arg"
-"""CPU kernels of the parallel and fan beam: branchless distance-driven (Basu and De Man 2006, Proc. SPIE 6142:65).
+"""CPU kernels of the parallel and fan beam: branchless distance-driven (Basu and De Man 2006, Proc.
+SPIE 6142:65).
 
-The overlap of a cell with the pixels of a grid row is the difference of the row's running sum at the two projected
-cell edges, read by linear interpolation. Three steps make it fast: slabs are summed per block before neighbouring edges
-are subtracted; the cell's width on the slab is a product of a factor of the slab and a factor of the cell; and all
-images that share the geometry (symmetric copies, batch) are lanes of one SIMD register. The adjoint spreads the same
-weights. Forward runs in parallel over views, the adjoint over slab blocks; all sums have a fixed order.
+The overlap of a cell with the pixels of a grid row is the difference of the row's running sum at
+the two projected cell edges, read by linear interpolation. Three steps make it fast: slabs are
+summed per block before neighbouring edges are subtracted; the cell's width on the slab is a product
+of a factor of the slab and a factor of the cell; and all images that share the geometry (symmetric
+copies, batch) are lanes of one SIMD register. The adjoint spreads the same weights. Forward runs in
+parallel over views, the adjoint over slab blocks; all sums have a fixed order.
 """
 
 from __future__ import annotations
@@ -18,18 +20,46 @@ from torchpcct.kernel_cache import forget_outdated
 from torchpcct.projector.cpu.cone_kernels import _depth_line, _edge_line, _kernel, _small
 from torchpcct.projector.cpu.simd import add_edges, sum_edges
 
-__all__ = ["TILE", "backproject", "cell_values", "collect", "deal", "load_image", "project", "spread_tasks", "tabulate"]
+__all__ = [
+    "TILE",
+    "backproject",
+    "cell_values",
+    "collect",
+    "deal",
+    "load_image",
+    "project",
+    "spread_tasks",
+    "tabulate",
+]
 
 BLOCK = 16  # slabs per block: their knots fit the second-level cache
 TILE = 32  # pixels of a tile's edge
 
 
 @_kernel
-def tabulate(segments, offset, pose, edges, centers, first, lattice, slabs, parallel, bias, across, p, q, gain, weight):
-    """Edge lines ``p, q`` and cell gains of every segment (at ``offset[s]``), slab weights ``(segments, …, lanes)``.
+def tabulate(
+    segments,
+    offset,
+    pose,
+    edges,
+    centers,
+    first,
+    lattice,
+    slabs,
+    parallel,
+    bias,
+    across,
+    p,
+    q,
+    gain,
+    weight,
+):
+    """Edge lines ``p, q`` and cell gains of every segment (at ``offset[s]``), slab weights
+    ``(segments, …, lanes)``.
 
-    Cell width on slab r: divergent ``(q1 - q0) (r - r_source)``, parallel ``p1 - p0``. ``bias``: added to p, per axis.
-    ``across``: ``(2, lanes)``, slabs by which each lane's slabs lie beyond the lattice's.
+    Cell width on slab r: divergent ``(q1 - q0) (r - r_source)``, parallel ``p1 - p0``. ``bias``:
+    added to p, per axis. ``across``: ``(2, lanes)``, slabs by which each lane's slabs lie beyond
+    the lattice's.
     """
     real = p.dtype.type
     lanes = across.shape[1]
@@ -42,17 +72,22 @@ def tabulate(segments, offset, pose, edges, centers, first, lattice, slabs, para
             p1, q1 = _edge_line(at, edges, first[v] + start + j, axis, lattice, parallel)
             p[here + j], q[here + j] = real(p1 + bias[axis]), real(q1)
             if j > 0:
-                _, _, path, _ = _depth_line(at, centers, first[v] + start + j - 1, axis, lattice, parallel)
+                _, _, path, _ = _depth_line(
+                    at, centers, first[v] + start + j - 1, axis, lattice, parallel
+                )
                 gain[here + j - 1] = real(path / (p1 - p0 if parallel else q1 - q0))
             p0, q0 = p1, q1
         gain[here + count] = 0
-        l0, l1, _, _ = _depth_line(at, centers, first[v] + start + count // 2, axis, lattice, parallel)
+        l0, l1, _, _ = _depth_line(
+            at, centers, first[v] + start + count // 2, axis, lattice, parallel
+        )
         for r in range(slabs[axis]):
             for l in range(lanes):
                 if parallel:
                     weight[s, r, l] = 1
                 else:
-                    # l0 + l1 r is proportional to the distance from the source, positive in front of it.
+                    # l0 + l1 r is proportional to the distance from the source, positive in front
+                    # of it.
                     depth = l0 + l1 * (r + across[axis, l])
                     weight[s, r, l] = real(l1 / depth) if depth > 1e-6 else real(0)
 
@@ -82,11 +117,12 @@ def _active(p, q, here, count, r0, r1, top):
 
 @njit(nogil=True, cache=True)
 def load_image(begin, end, image, address, place, count, width, sums):
-    """Running sums of one axis, ``(slabs, knots, lanes)``, of ``(batch, pixels)`` under the lane addresses.
+    """Running sums of one axis, ``(slabs, knots, lanes)``, of ``(batch, pixels)`` under the lane
+    addresses.
 
-    ``address``: ``(lanes, 4)``: batch index, base, per slab, per step. ``place``: ``(lanes, 2)``: slab and knot where
-    the ``count`` slabs of ``width`` pixels begin; all around is zero. The last knot repeats up to the end, so that the
-    interpolation may read beyond it.
+    ``address``: ``(lanes, 4)``: batch index, base, per slab, per step. ``place``: ``(lanes, 2)``:
+    slab and knot where the ``count`` slabs of ``width`` pixels begin; all around is zero. The last
+    knot repeats up to the end, so that the interpolation may read beyond it.
     """
     _, knots, lanes = sums.shape
     for r in range(begin, end):
@@ -110,7 +146,23 @@ def load_image(begin, end, image, address, place, count, width, sums):
 
 @_small
 def _project_view(
-    lanes, reach, segments, offset, s0, s1, axis, sums, stride, slabs, top, p, q, gain, weight, apart, out
+    lanes,
+    reach,
+    segments,
+    offset,
+    s0,
+    s1,
+    axis,
+    sums,
+    stride,
+    slabs,
+    top,
+    p,
+    q,
+    gain,
+    weight,
+    apart,
+    out,
 ):
     width = len(lanes)
     for r0 in range(0, slabs, BLOCK):
@@ -120,9 +172,22 @@ def _project_view(
                 start, count, here = segments[s, 2], segments[s, 3], offset[s]
                 e0, e1 = _active(p, q, here, count, r0, r1, top)
                 sum_edges(
-                    lanes, reach, sums, stride, p[here:], q[here:], weight[s], gain[here:], e0, e1, r0, r1, top,
-                    apart, out[start * width :],
-                )  # fmt: skip
+                    lanes,
+                    reach,
+                    sums,
+                    stride,
+                    p[here:],
+                    q[here:],
+                    weight[s],
+                    gain[here:],
+                    e0,
+                    e1,
+                    r0,
+                    r1,
+                    top,
+                    apart,
+                    out[start * width :],
+                )
 
 
 @_small
@@ -132,10 +197,27 @@ def _beyond(reach):
 
 
 @njit(nogil=True, cache=True)
-def project(begin, end, lanes, reach, segments, offset, start, by_row, by_column, p, q, gain, weight, apart, out):
+def project(
+    begin,
+    end,
+    lanes,
+    reach,
+    segments,
+    offset,
+    start,
+    by_row,
+    by_column,
+    p,
+    q,
+    gain,
+    weight,
+    apart,
+    out,
+):
     """Lane readings of canonical views, ``out``: ``(views, columns * lanes)``, overwritten.
 
-    ``by_row, by_column``: ``(slabs, knots * lanes)``. ``apart``: ``(2, 2 * lanes)``, see ``simd.sum_edges``.
+    ``by_row, by_column``: ``(slabs, knots * lanes)``. ``apart``: ``(2, 2 * lanes)``, see
+    ``simd.sum_edges``.
     """
     width = len(lanes)
     real = by_row.dtype.type
@@ -147,9 +229,24 @@ def project(begin, end, lanes, reach, segments, offset, start, by_row, by_column
             slabs, stride = sums.shape
             top = real(stride // width - 1 - _beyond(reach))
             _project_view(
-                lanes, reach, segments, offset, start[v], start[v + 1], axis, sums.reshape(-1), stride, slabs, top,
-                p, q, gain, weight, apart[axis], line,
-            )  # fmt: skip
+                lanes,
+                reach,
+                segments,
+                offset,
+                start[v],
+                start[v + 1],
+                axis,
+                sums.reshape(-1),
+                stride,
+                slabs,
+                top,
+                p,
+                q,
+                gain,
+                weight,
+                apart[axis],
+                line,
+            )
 
 
 @_kernel
@@ -172,7 +269,8 @@ def deal(out, target, reverse, batch, data):
 
 @_kernel
 def cell_values(data, target, reverse, segments, offset, gain, values):
-    """Transpose of ``deal``: readings times their gain as ``values``, ``(entries, lanes)``, overwritten."""
+    """Transpose of ``deal``: readings times their gain as ``values``, ``(entries, lanes)``,
+    overwritten."""
     operations = target.shape[1]
     batch, _, columns = data.shape
     for s in range(segments.shape[0]):
@@ -189,16 +287,30 @@ def cell_values(data, target, reverse, segments, offset, gain, values):
 
 
 @_small
-def _spread_block(lanes, reach, segments, offset, axis, r0, r1, top, p, q, weight, apart, values, out, stride):
+def _spread_block(
+    lanes, reach, segments, offset, axis, r0, r1, top, p, q, weight, apart, values, out, stride
+):
     width = len(lanes)
     for s in range(segments.shape[0]):
         if segments[s, 1] == axis:
             count, here = segments[s, 3], offset[s]
             e0, e1 = _active(p, q, here, count, r0, r1, top)
             add_edges(
-                lanes, reach, out, stride, p[here:], q[here:], weight[s], e0, e1, r0, r1, top, apart,
+                lanes,
+                reach,
+                out,
+                stride,
+                p[here:],
+                q[here:],
+                weight[s],
+                e0,
+                e1,
+                r0,
+                r1,
+                top,
+                apart,
                 values[here * width :],
-            )  # fmt: skip
+            )
 
 
 @_small
@@ -224,26 +336,57 @@ def spread_tasks(size: NDArray[np.int64]) -> int:
 
 @njit(nogil=True, cache=True)
 def backproject(
-    begin, end, lanes, reach, segments, offset, p, q, weight, apart, values, size, place, by_row, by_column
+    begin,
+    end,
+    lanes,
+    reach,
+    segments,
+    offset,
+    p,
+    q,
+    weight,
+    apart,
+    values,
+    size,
+    place,
+    by_row,
+    by_column,
 ):
-    """Transpose of :func:`project`: cell values ``(entries * lanes,)`` to ``(lanes, slabs, width)`` per axis.
+    """Transpose of :func:`project`: cell values ``(entries * lanes,)`` to ``(lanes, slabs, width)``
+    per axis.
 
-    ``size``: ``(2, 2)``, slabs and knots per axis. ``place``: ``(2, lanes, 2)``, see ``load_image``.
+    ``size``: ``(2, 2)``, slabs and knots per axis. ``place``: ``(2, lanes, 2)``, see
+    ``load_image``.
     """
     width = len(lanes)
     real = by_row.dtype.type
     row_tasks = (size[0, 0] + BLOCK - 1) // BLOCK
     for task in range(begin, end):
         axis = 0 if task < row_tasks else 1
-        planes, r0 = (by_row, task * BLOCK) if axis == 0 else (by_column, (task - row_tasks) * BLOCK)
+        planes, r0 = (
+            (by_row, task * BLOCK) if axis == 0 else (by_column, (task - row_tasks) * BLOCK)
+        )
         r1 = min(r0 + BLOCK, size[axis, 0])
         knots = size[axis, 1]
         out = np.zeros((r1 - r0) * knots * width, dtype=by_row.dtype)
         total = np.empty(width, dtype=by_row.dtype)
         _spread_block(
-            lanes, reach, segments, offset, axis, r0, r1, real(knots - 1 - _beyond(reach)), p, q, weight, apart[axis],
-            values, out, knots * width,
-        )  # fmt: skip
+            lanes,
+            reach,
+            segments,
+            offset,
+            axis,
+            r0,
+            r1,
+            real(knots - 1 - _beyond(reach)),
+            p,
+            q,
+            weight,
+            apart[axis],
+            values,
+            out,
+            knots * width,
+        )
         _reverse_sums(out, r0, r1, knots, width, total, place[axis], planes)
 
 
@@ -258,10 +401,11 @@ def _collect_tile(plane, at, y0, y1, x0, x1, swap, image):
 
 @njit(nogil=True, cache=True)
 def collect(begin, end, by_row, by_column, inverse, operations, image):
-    """Sum the lanes back onto ``image``, ``(batch, ny, nx)``, by rows of tiles; transpose of ``load_image``, both axes.
+    """Sum the lanes back onto ``image``, ``(batch, ny, nx)``, by rows of tiles; transpose of
+    ``load_image``, both axes.
 
-    ``inverse``: ``(operations, 6)``: row and column of the operated image read at pixel (y, x), each as
-    base, per y, per x. Tiles, since half of the lanes are read across their rows.
+    ``inverse``: ``(operations, 6)``: row and column of the operated image read at pixel (y, x),
+    each as base, per y, per x. Tiles, since half of the lanes are read across their rows.
     """
     batch, ny, nx = image.shape
     for tile in range(begin, end):
@@ -271,8 +415,12 @@ def collect(begin, end, by_row, by_column, inverse, operations, image):
             for x0 in range(0, nx, TILE):
                 for g in range(operations):
                     l = n * operations + g
-                    _collect_tile(by_row[l], inverse[g], y0, y1, x0, min(x0 + TILE, nx), False, image[n])
-                    _collect_tile(by_column[l], inverse[g], y0, y1, x0, min(x0 + TILE, nx), True, image[n])
+                    _collect_tile(
+                        by_row[l], inverse[g], y0, y1, x0, min(x0 + TILE, nx), False, image[n]
+                    )
+                    _collect_tile(
+                        by_column[l], inverse[g], y0, y1, x0, min(x0 + TILE, nx), True, image[n]
+                    )
 
 
 forget_outdated(__name__)

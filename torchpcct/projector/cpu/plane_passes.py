@@ -1,5 +1,6 @@
 # mypy: disable-error-code="call-arg"
-"""The passes of the parallel and fan beam: tables made once per dtype, images dealt to lanes, kernels launched."""
+"""The passes of the parallel and fan beam: tables made once per dtype, images dealt to lanes,
+kernels launched."""
 
 from __future__ import annotations
 
@@ -25,15 +26,18 @@ from torchpcct.threads import run
 __all__ = ["PlanePasses"]
 
 _WIDTHS = (1, 2, 4, 8)
-# Lanes whose positions spread over this many voxels at most reach two, or three, intervals between knots.
-_NEAR, _FAR = 1.0, 2.0
+# Lanes whose positions spread over this many voxels at most reach two, or three, intervals between
+# knots.
+_NEAR = 1.0
+_FAR = 2.0
 
 
 class _LaneTables:
-    """Edge lines, gains and slab weights of the projected views, and the lanes' places, in one dtype.
+    """Edge lines, gains and slab weights of the projected views, and the lanes' places, in one
+    dtype.
 
-    ``apart``: ``(2, 2 * lanes)`` per axis: at an edge of the slope q, lane l reads ``q * apart[l] + apart[lanes + l]``
-    beyond the shared position.
+    ``apart``: ``(2, 2 * lanes)`` per axis: at an edge of the slope q, lane l reads ``q * apart[l] +
+    apart[lanes + l]`` beyond the shared position.
     """
 
     def __init__(self, passes: PlanePasses, dtype: np.dtype, width: int, steepest: float) -> None:
@@ -48,21 +52,40 @@ class _LaneTables:
             self.reach = (0,) * (2 if spread.max() <= _NEAR else 3)
             bias = len(self.reach) + lowest
             for axis in range(2):
-                self.apart[axis] = np.concatenate([part[:, axis], -part[:, 1 - axis] - lowest[axis]])
-        self.weight = np.empty((len(passes.segments), max(passes.placement.shape), len(part)), dtype=dtype)
+                self.apart[axis] = np.concatenate(
+                    [part[:, axis], -part[:, 1 - axis] - lowest[axis]]
+                )
+        self.weight = np.empty(
+            (len(passes.segments), max(passes.placement.shape), len(part)), dtype=dtype
+        )
         rays = passes.rays
         pose = np.ascontiguousarray(rays.pose[passes.orbits.views])
         first = np.ascontiguousarray(rays.first[passes.orbits.views])
         tabulate(
-            passes.segments, passes.offset, pose, rays.edges, rays.centers, first, passes.lattice,
-            np.array(passes.placement.shape), rays.parallel, bias, np.ascontiguousarray(part.T), self.p, self.q,
-            self.gain, self.weight,
-        )  # fmt: skip
+            passes.segments,
+            passes.offset,
+            pose,
+            rays.edges,
+            rays.centers,
+            first,
+            passes.lattice,
+            np.array(passes.placement.shape),
+            rays.parallel,
+            bias,
+            np.ascontiguousarray(part.T),
+            self.p,
+            self.q,
+            self.gain,
+            self.weight,
+        )
         self.weight = self.weight.reshape(len(passes.segments), -1)
 
 
-def _lane_range(part: NDArray[np.float64], steepest: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Per axis: lowest position of a lane against the shared one for slopes up to ``steepest``, and the spread."""
+def _lane_range(
+    part: NDArray[np.float64], steepest: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Per axis: lowest position of a lane against the shared one for slopes up to ``steepest``,
+    and the spread."""
     across, along = part, -part[:, ::-1]  # axis 0: slabs are rows
     lowest = (along - steepest * np.abs(across)).min(axis=0)
     return lowest, (along + steepest * np.abs(across)).max(axis=0) - lowest
@@ -73,7 +96,9 @@ class PlanePasses:
 
     def __init__(self, tables: Tables) -> None:
         self.grid, self.rays = tables.grid, tables.rays
-        self._lay_out(tables.segments, find_orbits(tables.geometry, tables.grid, tables.rays, tables.windowed))
+        self._lay_out(
+            tables.segments, find_orbits(tables.geometry, tables.grid, tables.rays, tables.windowed)
+        )
         if self.placement.apart:
             self._steepest = float(np.abs(_LaneTables(self, np.dtype(np.float64), 1, 0.0).q).max())
             if _lane_range(self.placement.part, self._steepest)[1].max() > _FAR:
@@ -130,7 +155,9 @@ class PlanePasses:
         lanes = self.lanes(batch)
         knots = int(self._size(3 if self.placement.apart else 0).prod(axis=1).sum())
         readings = max(self.orbits.views.size * self.rays.columns, self.entries)
-        weights = len(self.segments) * max(self.placement.shape) * (lanes if self.placement.apart else 1)
+        weights = (
+            len(self.segments) * max(self.placement.shape) * (lanes if self.placement.apart else 1)
+        )
         return itemsize * (lanes * (knots + readings) + 3 * self.entries + weights)
 
     def forward(self, x: NDArray) -> NDArray:
@@ -149,14 +176,42 @@ class PlanePasses:
                 lines = np.empty((*shape, width), dtype=x.dtype)
                 slabs, pixels = (ny, nx) if axis == 0 else (nx, ny)
                 table = self._lane_table(n, count, width, axis)
-                run(load_image, len(lines), images, table, places[axis], slabs, pixels, lines, operations=lines[0].size)
+                run(
+                    load_image,
+                    len(lines),
+                    images,
+                    table,
+                    places[axis],
+                    slabs,
+                    pixels,
+                    lines,
+                    operations=lines[0].size,
+                )
                 sums.append(lines.reshape(shape[0], -1))
             run(
-                project, len(out), (0,) * width, t.reach, self.segments, self.offset, self.start, *sums, t.p, t.q,
-                t.gain, t.weight, t.apart, out,
-            )  # fmt: skip
+                project,
+                len(out),
+                (0,) * width,
+                t.reach,
+                self.segments,
+                self.offset,
+                self.start,
+                *sums,
+                t.p,
+                t.q,
+                t.gain,
+                t.weight,
+                t.apart,
+                out,
+            )
             orbits = self.orbits
-            deal(out.reshape(len(out), -1, width), orbits.target, orbits.reverse, count, y[n : n + count])
+            deal(
+                out.reshape(len(out), -1, width),
+                orbits.target,
+                orbits.reverse,
+                count,
+                y[n : n + count],
+            )
         return y
 
     def adjoint(self, y: NDArray) -> NDArray:
@@ -172,17 +227,42 @@ class PlanePasses:
         for n in range(0, y.shape[0], step):
             part = y[n : n + step]
             orbits = self.orbits
-            cell_values(part, orbits.target, orbits.reverse, self.segments, self.offset, t.gain, values)
+            cell_values(
+                part, orbits.target, orbits.reverse, self.segments, self.offset, t.gain, values
+            )
             run(
-                backproject, spread_tasks(size), (0,) * width, t.reach, self.segments, self.offset, t.p, t.q, t.weight,
-                t.apart, values.reshape(-1), size, places, by_row, by_column,
-            )  # fmt: skip
+                backproject,
+                spread_tasks(size),
+                (0,) * width,
+                t.reach,
+                self.segments,
+                self.offset,
+                t.p,
+                t.q,
+                t.weight,
+                t.apart,
+                values.reshape(-1),
+                size,
+                places,
+                by_row,
+                by_column,
+            )
             tiles, pixels = -(-ny // TILE), TILE * nx * 2 * width
-            run(collect, tiles, by_row, by_column, self.inverse, self.operations, x[n : n + step], operations=pixels)
+            run(
+                collect,
+                tiles,
+                by_row,
+                by_column,
+                self.inverse,
+                self.operations,
+                x[n : n + step],
+                operations=pixels,
+            )
         return x
 
     def _lane_table(self, first: int, count: int, width: int, axis: int) -> NDArray[np.int64]:
-        """``(lanes, 4)``: image, base, step per slab, step along the slab; spare lanes repeat the first."""
+        """``(lanes, 4)``: image, base, step per slab, step along the slab; spare lanes repeat
+        the first."""
         table = np.zeros((width, 4), dtype=np.int64)
         table[:, 0], table[:, 1:] = first, self.addresses[0]
         for n in range(count):
@@ -192,7 +272,8 @@ class PlanePasses:
 
 
 def _inverse(affine: NDArray[np.int64], ny: int, nx: int) -> NDArray[np.int64]:
-    """Row and column of the operated image that show pixel (y, x): two times (base, per y, per x)."""
+    """Row and column of the operated image that show pixel (y, x): two times (base, per y, per
+    x)."""
     base, down, right = (int(v) for v in affine)
     rows = np.arange(ny * nx).reshape(ny, nx)
     index = (base + down * np.arange(ny)[:, None] + right * np.arange(nx)).ravel()

@@ -1,14 +1,15 @@
 """The inner loops of the kernels as explicit SIMD, through LLVM vectors.
 
-In the plane kernels a lane is an image that shares its geometry with the others: a rotated or mirrored copy, or another
-image of the batch. All lanes of an edge use one interpolation index, so that every load is contiguous. Copies of a grid
-off the axis lie a part of a voxel apart: then each lane interpolates at its own place among three or four shared knots
-(``reach``: 2 or 3 intervals; 0: the lanes lie at the same place). In the volume kernels the lanes lie along z. numba's
-own vectoriser does not find these loops reliably; LLVM vectors are portable all the same, LLVM splits or merges them
-for the machine it compiles for.
+In the plane kernels a lane is an image that shares its geometry with the others: a rotated or
+mirrored copy, or another image of the batch. All lanes of an edge use one interpolation index, so
+that every load is contiguous. Copies of a grid off the axis lie a part of a voxel apart: then each
+lane interpolates at its own place among three or four shared knots (``reach``: 2 or 3 intervals; 0:
+the lanes lie at the same place). In the volume kernels the lanes lie along z. numba's own
+vectoriser does not find these loops reliably; LLVM vectors are portable all the same, LLVM splits
+or merges them for the machine it compiles for.
 
-The vector width is the length of the tuple ``lanes`` and the reach that of the tuple ``reach``, so that numba compiles
-one version of each and caches it.
+The vector width is the length of the tuple ``lanes`` and the reach that of the tuple ``reach``, so
+that numba compiles one version of each and caches it.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ _FUSED = ("contract", "nsz", "arcp", "reassoc")
 
 
 class _Code:
-    """Helpers to write the loops; ``real``: the scalar type, ``wide``: all lanes, ``double``: those of two knots."""
+    """Helpers to write the loops; ``real``: the scalar type, ``wide``: all lanes, ``double``:
+    those of two knots."""
 
     def __init__(self, context: Any, builder: Any, signature: Any, args: Any) -> None:
         self.b, self.context = builder, context
@@ -67,7 +69,9 @@ class _Code:
         return self.shuffle(one, undefined, [0] * count)
 
     def shuffle(self, a: Any, b: Any, places: list[int]) -> Any:
-        return self.b.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(places)), places))
+        return self.b.shuffle_vector(
+            a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(places)), places)
+        )
 
     def clamp(self, value: Any, top: Any) -> Any:
         zero = ir.Constant(value.type, None)
@@ -78,10 +82,13 @@ class _Code:
         return self.b.mul(index, ir.Constant(self.index, factor), flags=("nsw", "nuw"))
 
     def _places(self, p: Any, q: Any, first: Any, count: int, top: Any) -> tuple[Any, Any]:
-        """Lower knots of ``t = p + q r`` and what ``t`` exceeds them by, for the slabs ``first … + count``."""
+        """Lower knots of ``t = p + q r`` and what ``t`` exceeds them by, for the slabs ``first …
+        + count``."""
         reals, integers = (ir.VectorType(self.real, count), ir.VectorType(ir.IntType(32), count))
         r = self.splat(self.b.sitofp(first, self.real), count)
-        r = self.add(r, ir.Constant(reals, [ir.Constant(self.real, float(i)) for i in range(count)]))
+        r = self.add(
+            r, ir.Constant(reals, [ir.Constant(self.real, float(i)) for i in range(count)])
+        )
         t = self.add(self.splat(p, count), self.mul(self.splat(q, count), r))
         t = self.clamp(t, self.splat(top, count))
         k = self.b.fptosi(t, integers)
@@ -90,36 +97,50 @@ class _Code:
     def _index(self, k: Any, i: int) -> Any:
         return self.b.zext(self.b.extract_element(k, ir.Constant(ir.IntType(32), i)), self.index)
 
-    def knots(self, p: Any, q: Any, first: Any, count: int, weight: Any, top: Any) -> list[tuple[Any, Any]]:
-        """Lower knot of ``t = p + q r`` and the weights of its lanes and the next knot's, slabs ``first … + count``.
+    def knots(
+        self, p: Any, q: Any, first: Any, count: int, weight: Any, top: Any
+    ) -> list[tuple[Any, Any]]:
+        """Lower knot of ``t = p + q r`` and the weights of its lanes and the next knot's, slabs
+        ``first … + count``.
 
-        Positions and weights of all slabs are one vector computation; ``weight`` points at the weight of slab 0.
+        Positions and weights of all slabs are one vector computation; ``weight`` points at the
+        weight of slab 0.
         """
         k, part = self._places(p, q, first, count, top)
         w = self.load(weight, first, part.type)
         high = self.mul(w, part)
         low = self.sub(w, high)
         return [
-            (self._index(k, i), self.shuffle(low, high, [i] * self.width + [count + i] * self.width))
+            (
+                self._index(k, i),
+                self.shuffle(low, high, [i] * self.width + [count + i] * self.width),
+            )
             for i in range(count)
         ]
 
     def knots_apart(
         self, p: Any, q: Any, first: Any, count: int, top: Any, ahead: Any, reach: int
     ) -> list[tuple[Any, list[Any]]]:
-        """First shared knot and the lanes' weights of the ``reach + 1`` knots from there, for each slab.
+        """First shared knot and the lanes' weights of the ``reach + 1`` knots from there, for each
+        slab.
 
         ``ahead``: how far each lane's position lies beyond the shared one, 0 ≤ ahead ≤ reach - 1.
         """
         k, part = self._places(p, q, first, count, top)
-        one, zero = ir.Constant(self.wide, [ir.Constant(self.real, 1.0)] * self.width), ir.Constant(self.wide, None)
+        one, zero = (
+            ir.Constant(self.wide, [ir.Constant(self.real, 1.0)] * self.width),
+            ir.Constant(self.wide, None),
+        )
         result = []
         for i in range(count):
             at = self.add(self.shuffle(part, part, [i] * self.width), ahead)
-            # Parts of the intervals that lie below the position; each knot gets the difference of its two.
+            # Parts of the intervals that lie below the position; each knot gets the difference of
+            # its two.
             covered = [one]
             for interval in range(reach):
-                start = ir.Constant(self.wide, [ir.Constant(self.real, float(interval))] * self.width)
+                start = ir.Constant(
+                    self.wide, [ir.Constant(self.real, float(interval))] * self.width
+                )
                 inside = self.sub(at, start) if interval else at
                 if interval:
                     inside = self.b.select(self.b.fcmp_ordered(">", inside, zero), inside, zero)
@@ -151,7 +172,8 @@ class _Code:
 
 
 def _written(write: Any, *kinds: Any) -> Any:
-    """Signature and code of an intrinsic without result: ``write(code, *values)`` writes its loops."""
+    """Signature and code of an intrinsic without result: ``write(code, *values)`` writes its
+    loops."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         code = _Code(context, builder, signature, args)
@@ -162,14 +184,20 @@ def _written(write: Any, *kinds: Any) -> Any:
 
 
 @intrinsic
-def sum_edges(typingctx, lanes, reach, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, apart, out):
-    """Sum slabs ``r0…r1`` at the edges ``e0…e1`` and add the differences of neighbouring edges to ``out``.
+def sum_edges(
+    typingctx, lanes, reach, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, apart, out
+):
+    """Sum slabs ``r0…r1`` at the edges ``e0…e1`` and add the differences of neighbouring edges to
+    ``out``.
 
-    ``lanes``: tuple of the vector's length W. ``reach``: tuple, see the module's text. ``sums``: running sums, slab r
-    starts at ``r * stride`` (in elements), knots of W lanes each. ``p, q``: edge lines, ``weight``: per slab (with a
-    reach: per slab and lane), ``gain``: per cell, ``apart``: see ``ahead``, ``out``: cells of W lanes.
+    ``lanes``: tuple of the vector's length W. ``reach``: tuple, see the module's text. ``sums``:
+    running sums, slab r starts at ``r * stride`` (in elements), knots of W lanes each. ``p, q``:
+    edge lines, ``weight``: per slab (with a reach: per slab and lane), ``gain``: per cell,
+    ``apart``: see ``ahead``, ``out``: cells of W lanes.
     """
-    signature = types.void(lanes, reach, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, apart, out)
+    signature = types.void(
+        lanes, reach, sums, stride, p, q, weight, gain, e0, e1, r0, r1, top, apart, out
+    )
 
     def codegen(context, builder, signature, args):
         c = _Code(context, builder, signature, args)
@@ -187,20 +215,35 @@ def sum_edges(typingctx, lanes, reach, sums, stride, p, q, weight, gain, e0, e1,
             ahead = c.ahead(apart, qe) if intervals else None
 
             def apart_body(first, count):
-                for i, (k, weights) in enumerate(c.knots_apart(pe, qe, first, count, top, ahead, intervals)):
-                    r, total = (builder.add(first, ir.Constant(c.index, i)), totals[i % len(totals)])
+                for i, (k, weights) in enumerate(
+                    c.knots_apart(pe, qe, first, count, top, ahead, intervals)
+                ):
+                    r, total = (
+                        builder.add(first, ir.Constant(c.index, i)),
+                        totals[i % len(totals)],
+                    )
                     base = builder.add(builder.mul(r, stride), c.times(k, c.width))
                     value = None
                     for m, w in enumerate(weights):
-                        part = c.mul(w, c.load(sums, builder.add(base, ir.Constant(c.index, m * c.width)), c.wide))
+                        part = c.mul(
+                            w,
+                            c.load(
+                                sums, builder.add(base, ir.Constant(c.index, m * c.width)), c.wide
+                            ),
+                        )
                         value = part if value is None else c.add(value, part)
                     value = c.mul(c.load(weight, c.times(r, c.width), c.wide), value)
                     builder.store(c.add(builder.load(total), value), total)
 
             def body(first, count):
                 for i, (k, weights) in enumerate(c.knots(pe, qe, first, count, weight, top)):
-                    r, total = (builder.add(first, ir.Constant(c.index, i)), totals[i % len(totals)])
-                    values = c.load(sums, builder.add(builder.mul(r, stride), c.times(k, c.width)), c.double)
+                    r, total = (
+                        builder.add(first, ir.Constant(c.index, i)),
+                        totals[i % len(totals)],
+                    )
+                    values = c.load(
+                        sums, builder.add(builder.mul(r, stride), c.times(k, c.width)), c.double
+                    )
                     builder.store(c.add(builder.load(total), c.mul(weights, values)), total)
 
             c.slabs(r0, r1, apart_body if intervals else body)
@@ -209,10 +252,14 @@ def sum_edges(typingctx, lanes, reach, sums, stride, p, q, weight, gain, e0, e1,
                 c.add(builder.load(totals[2]), builder.load(totals[3])),
             )
             if not intervals:
-                now = c.add(*(c.shuffle(now, now, list(range(i, i + c.width))) for i in (0, c.width)))
+                now = c.add(
+                    *(c.shuffle(now, now, list(range(i, i + c.width))) for i in (0, c.width))
+                )
             with builder.if_then(builder.icmp_signed(">", edge.index, e0)):
                 cell = builder.sub(edge.index, ir.Constant(c.index, 1))
-                change = c.mul(c.splat(c.load(gain, cell, c.real), c.width), c.sub(now, builder.load(before)))
+                change = c.mul(
+                    c.splat(c.load(gain, cell, c.real), c.width), c.sub(now, builder.load(before))
+                )
                 where = c.times(cell, c.width)
                 c.store(c.add(c.load(out, where, c.wide), change), out, where)
             builder.store(now, before)
@@ -222,12 +269,18 @@ def sum_edges(typingctx, lanes, reach, sums, stride, p, q, weight, gain, e0, e1,
 
 
 @intrinsic
-def add_edges(typingctx, lanes, reach, out, stride, p, q, weight, e0, e1, r0, r1, top, apart, values):
-    """Transpose of ``sum_edges``: spread cell values (already times their gain) to the knots of slabs ``r0…r1``.
+def add_edges(
+    typingctx, lanes, reach, out, stride, p, q, weight, e0, e1, r0, r1, top, apart, values
+):
+    """Transpose of ``sum_edges``: spread cell values (already times their gain) to the knots of
+    slabs ``r0…r1``.
 
-    ``values``: cells of W lanes, one more entry than cells. ``out``: slab r starts at ``(r - r0) * stride``.
+    ``values``: cells of W lanes, one more entry than cells. ``out``: slab r starts at ``(r - r0) *
+    stride``.
     """
-    signature = types.void(lanes, reach, out, stride, p, q, weight, e0, e1, r0, r1, top, apart, values)
+    signature = types.void(
+        lanes, reach, out, stride, p, q, weight, e0, e1, r0, r1, top, apart, values
+    )
 
     def codegen(context, builder, signature, args):
         c = _Code(context, builder, signature, args)
@@ -248,7 +301,9 @@ def add_edges(typingctx, lanes, reach, out, stride, p, q, weight, e0, e1, r0, r1
             ahead = c.ahead(apart, qe) if intervals else None
 
             def apart_body(first, count):
-                for i, (k, weights) in enumerate(c.knots_apart(pe, qe, first, count, top, ahead, intervals)):
+                for i, (k, weights) in enumerate(
+                    c.knots_apart(pe, qe, first, count, top, ahead, intervals)
+                ):
                     r = builder.add(first, ir.Constant(c.index, i))
                     base = builder.add(builder.mul(builder.sub(r, r0), stride), c.times(k, c.width))
                     given = c.mul(c.load(weight, c.times(r, c.width), c.wide), value)
@@ -269,7 +324,8 @@ def add_edges(typingctx, lanes, reach, out, stride, p, q, weight, e0, e1, r0, r1
 
 
 def _columns(c: Any, size: Any, body: Any) -> None:
-    """Call ``body(first, vectors)`` for stretches of four vectors of W lanes along z, then of one."""
+    """Call ``body(first, vectors)`` for stretches of four vectors of W lanes along z, then of
+    one."""
     long = 4 * c.width
     groups = c.b.sdiv(size, ir.Constant(c.index, long))
     with cgutils.for_range(c.b, groups) as loop:
@@ -282,7 +338,8 @@ def _columns(c: Any, size: Any, body: Any) -> None:
 
 @intrinsic
 def add_lines(typingctx, lanes, lines, offset, low, high, e0, e1, size, below, above):
-    """``below += Σ_e low[e] lines[offset[e]:]`` and ``above += Σ_e high[e] lines[offset[e]:]``, e from e0 to e1.
+    """``below += Σ_e low[e] lines[offset[e]:]`` and ``above += Σ_e high[e] lines[offset[e]:]``, e
+    from e0 to e1.
 
     ``size``: elements of a line, a multiple of the vector's length W. The sums stay in registers.
     """
@@ -295,7 +352,8 @@ def add_lines(typingctx, lanes, lines, offset, low, high, e0, e1, size, below, a
 
 @intrinsic
 def sum_lines(typingctx, lanes, lines, offset, low, e0, e1, size, total):
-    """``total = Σ_e low[e] lines[offset[e]:]``: as ``add_lines``, for slabs that belong to no two layers."""
+    """``total = Σ_e low[e] lines[offset[e]:]``: as ``add_lines``, for slabs that belong to no
+    two layers."""
 
     def write(c, _, lines, offset, low, e0, e1, size, total):
         _gather_lines(c, lines, offset, (low,), e0, e1, size, (total,), fresh=True)
@@ -304,9 +362,18 @@ def sum_lines(typingctx, lanes, lines, offset, low, e0, e1, size, total):
 
 
 def _gather_lines(
-    c: Any, lines: Any, offset: Any, weights: Any, e0: Any, e1: Any, size: Any, targets: Any, fresh: bool
+    c: Any,
+    lines: Any,
+    offset: Any,
+    weights: Any,
+    e0: Any,
+    e1: Any,
+    size: Any,
+    targets: Any,
+    fresh: bool,
 ) -> None:
-    """Weighted sums of lines, one per target; ``fresh``: what the targets held before is overwritten."""
+    """Weighted sums of lines, one per target; ``fresh``: what the targets held before is
+    overwritten."""
     b = c.b
     sums = [[cgutils.alloca_once(b, c.wide) for _ in range(4)] for _ in targets]
 
@@ -331,7 +398,8 @@ def _gather_lines(
 
 @intrinsic
 def spread_lines(typingctx, lanes, lines, offset, low, high, e0, e1, size, below, above):
-    """Transpose of ``add_lines``: ``lines[offset[e]:] += low[e] below + high[e] above`` for e from e0 to e1."""
+    """Transpose of ``add_lines``: ``lines[offset[e]:] += low[e] below + high[e] above`` for e
+    from e0 to e1."""
 
     def write(c, _, lines, offset, low, high, e0, e1, size, below, above):
         _spread(c, lines, offset, (low, high), e0, e1, size, (below, above))
@@ -349,7 +417,9 @@ def spread_line(typingctx, lanes, lines, offset, low, e0, e1, size, line):
     return _written(write, lanes, lines, offset, low, e0, e1, size, line)
 
 
-def _spread(c: Any, lines: Any, offset: Any, weights: Any, e0: Any, e1: Any, size: Any, sources: Any) -> None:
+def _spread(
+    c: Any, lines: Any, offset: Any, weights: Any, e0: Any, e1: Any, size: Any, sources: Any
+) -> None:
     """Add weighted sums of the sources to lines."""
     b = c.b
 

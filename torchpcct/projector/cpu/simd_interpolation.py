@@ -1,8 +1,10 @@
-"""Linear interpolation at equally spaced positions, eight at a time, and the steps between them, as explicit SIMD.
+"""Linear interpolation at equally spaced positions, eight at a time, and the steps between them, as
+explicit SIMD.
 
-Row edges lie evenly along a line of voxels. Eight neighbours of them read at most 8 (16) knots when they lie less than
-one (two) knots apart: these are loaded whole and picked in registers, where AVX2 has a permutation for it. Elsewhere,
-and for larger steps, each pair of knots is loaded on its own. The arithmetic is the same.
+Row edges lie evenly along a line of voxels. Eight neighbours of them read at most 8 (16) knots when
+they lie less than one (two) knots apart: these are loaded whole and picked in registers, where AVX2
+has a permutation for it. Elsewhere, and for larger steps, each pair of knots is loaded on its own.
+The arithmetic is the same.
 """
 
 from __future__ import annotations
@@ -19,21 +21,25 @@ from torchpcct.projector.cpu.simd import _written
 __all__ = ["add_steps", "set_steps"]
 
 # Eight positions at most this far apart fall on 8, or on 16, neighbouring knots.
-_STEP_OF_8, _STEP_OF_16 = 0.999, 2.13
+_STEP_OF_8 = 0.999
+_STEP_OF_16 = 2.13
 
 
 @intrinsic
 def add_steps(typingctx, lanes, line, zeta0, step, last, size, gain, out, count):
-    """``out[i] += gain * (line(i + 1) - line(i))`` for i < count, ``line(i)`` that at ``zeta0 + step * i``.
+    """``out[i] += gain * (line(i + 1) - line(i))`` for i < count, ``line(i)`` that at ``zeta0 +
+    step * i``.
 
-    ``line``: knots 0…last, to which positions are clamped, with ``size`` elements, > last. ``lanes``: tuple of the
-    vector's length W. ``count``: a multiple of W.
+    ``line``: knots 0…last, to which positions are clamped, with ``size`` elements, > last.
+    ``lanes``: tuple of the vector's length W. ``count``: a multiple of W.
     """
 
     def write(c, _, line, zeta0, step, last, size, gain, out, count):
         wide = c.splat(gain, c.width)
         steps = _Steps(c, line, zeta0, step, last, size, count)
-        steps.give(lambda change, at: c.store(c.add(c.load(out, at, c.wide), c.mul(wide, change)), out, at))
+        steps.give(
+            lambda change, at: c.store(c.add(c.load(out, at, c.wide), c.mul(wide, change)), out, at)
+        )
 
     return _written(write, lanes, line, zeta0, step, last, size, gain, out, count)
 
@@ -52,7 +58,9 @@ def set_steps(typingctx, lanes, line, zeta0, step, last, size, out, count):
 class _Steps:
     """What a line rises by from each of evenly spaced positions to the next."""
 
-    def __init__(self, c: Any, line: Any, zeta0: Any, step: Any, last: Any, size: Any, count: Any) -> None:
+    def __init__(
+        self, c: Any, line: Any, zeta0: Any, step: Any, last: Any, size: Any, count: Any
+    ) -> None:
         self.c, self.line, self.step, self.size, self.count = c, line, step, size, count
         self.positions = _Positions(c, zeta0, step, last)
 
@@ -79,7 +87,9 @@ class _Steps:
                 with rest:
                     self._run(self._one_by_one, take)
 
-    def _run(self, pick: Callable[[Any], tuple[Any, Any]], take: Callable[[Any, Any], None]) -> None:
+    def _run(
+        self, pick: Callable[[Any], tuple[Any, Any]], take: Callable[[Any, Any], None]
+    ) -> None:
         """The values of a vector stay in registers until those of the next are known."""
         c = self.c
 
@@ -137,15 +147,20 @@ def _pick(c: Any, line: Any, size: Any, k: Any, vectors: int) -> tuple[Any, Any]
     kind = ir.FunctionType(c.wide, [c.wide, k.type])
     permute = cgutils.get_or_insert_function(c.b.module, kind, "llvm.x86.avx2.permps")
     base = c.b.sext(c.b.extract_element(k, ir.Constant(ir.IntType(32), 0)), c.index)
-    highest = c.b.sub(size, ir.Constant(c.index, 8 * vectors + 1))  # the last load must not leave the line
+    # the last load must not leave the line
+    highest = c.b.sub(size, ir.Constant(c.index, 8 * vectors + 1))
     base = c.b.select(c.b.icmp_signed("<", base, highest), base, highest)
     place = c.b.sub(k, c.splat(c.b.trunc(base, ir.IntType(32)), c.width))
-    beyond = c.b.icmp_signed(">", place, ir.Constant(k.type, [ir.Constant(ir.IntType(32), 7)] * c.width))
+    beyond = c.b.icmp_signed(
+        ">", place, ir.Constant(k.type, [ir.Constant(ir.IntType(32), 7)] * c.width)
+    )
     found = []
     for next_ in range(2):
         start = c.b.add(base, ir.Constant(c.index, next_))
         parts = [
-            c.b.call(permute, [c.load(line, c.b.add(start, ir.Constant(c.index, 8 * v)), c.wide), place])
+            c.b.call(
+                permute, [c.load(line, c.b.add(start, ir.Constant(c.index, 8 * v)), c.wide), place]
+            )
             for v in range(vectors)
         ]
         found.append(parts[0] if vectors == 1 else c.b.select(beyond, parts[1], parts[0]))

@@ -1,10 +1,10 @@
 """Which rotations and reflections of the image map the scan onto itself.
 
-An operation ``(m, s)`` maps a point ``p`` to ``R^m S^s p``: R turns by 90° counter-clockwise, S mirrors y. If it maps
-every view to another view of the scan, the readings of view β of the image ``f(R^m S^s p)`` are the readings of the
-mapped view of ``f``. Then one pass over a part of the views serves all operations at once. The grid need not be
-centred on the axis: the operated grids then lie apart from each other, by whole voxels and by a part of one
-(:class:`Placement`).
+An operation ``(m, s)`` maps a point ``p`` to ``R^m S^s p``: R turns by 90° counter-clockwise, S
+mirrors y. If it maps every view to another view of the scan, the readings of view β of the image
+``f(R^m S^s p)`` are the readings of the mapped view of ``f``. Then one pass over a part of the
+views serves all operations at once. The grid need not be centred on the axis: the operated grids
+then lie apart from each other, by whole voxels and by a part of one (:class:`Placement`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ _SETS = (
     [(0, 0), (0, 1)],
     [(0, 0)],
 )
-# Relative time of one pass with that many lanes (a vector of 8 float32 is one register), at the same place and apart.
+# Relative time of one pass with that many lanes (a vector of 8 float32 is one register), at the
+# same place and apart.
 _COST = {1: 1.0, 2: 1.2, 4: 1.3, 8: 1.5}
 _COST_APART = {2: 2.6, 4: 2.8, 8: 3.2}
 _TOLERANCE = 1e-9  # rad
@@ -46,7 +47,8 @@ class Orbits:
     Args:
         operations: the operations ``(m, s)``, the identity first.
         views: ``(n,)`` int64, the views that are projected.
-        target: ``(n, lanes)`` int64, the view that each lane is the reading of, or -1 (a double, to be ignored).
+        target: ``(n, lanes)`` int64, the view that each lane is the reading of, or -1 (a double, to
+            be ignored).
         reverse: ``(n, lanes)`` int64, 1 if the lane's columns run backwards.
     """
 
@@ -63,7 +65,8 @@ class Placement:
     Args:
         center: centre of the lattice's voxels ``(y, x)``, mm, for a lattice of the shape ``shape``.
         shape: rows and columns of the lattice.
-        shift: ``(operations, 2)`` int64, row and column of the lattice where each operated grid begins.
+        shift: ``(operations, 2)`` int64, row and column of the lattice where each operated grid
+            begins.
         part: ``(operations, 2)`` float64, part of a row and column by which it lies beyond that.
     """
 
@@ -111,11 +114,14 @@ def place(operations: tuple[tuple[int, int], ...], grid: VolumeGrid) -> Placemen
 
 def no_orbits(views: int) -> Orbits:
     """Every view on its own."""
-    return Orbits(((0, 0),), np.arange(views), np.arange(views)[:, None], np.zeros((views, 1), dtype=np.int64))
+    return Orbits(
+        ((0, 0),), np.arange(views), np.arange(views)[:, None], np.zeros((views, 1), dtype=np.int64)
+    )
 
 
 def find_orbits(geometry: Geometry, grid: VolumeGrid, rays: Rays, windowed: bool) -> Orbits:
-    """The cheapest set of operations (the identity alone, if the scan or the grid has no symmetry)."""
+    """The cheapest set of operations (the identity alone, if the scan or the grid has no
+    symmetry)."""
     views = geometry.views
     trivial = no_orbits(views)
     turn = 2 * math.pi
@@ -125,7 +131,9 @@ def find_orbits(geometry: Geometry, grid: VolumeGrid, rays: Rays, windowed: bool
     gaps = np.diff(np.append(sorted_angles, sorted_angles[0] + turn))
     if windowed or (views > 1 and gaps.min() < _TOLERANCE):
         return trivial
-    square = grid.shape[0] == grid.shape[1] and math.isclose(grid.spacing[0], grid.spacing[1], rel_tol=1e-12)
+    square = grid.shape[0] == grid.shape[1] and math.isclose(
+        grid.spacing[0], grid.spacing[1], rel_tol=1e-12
+    )
     position = rays.edges[:, 1] if rays.edges.shape[0] else np.zeros(1)
     even = bool(np.abs(position + position[::-1]).max() <= 1e-9 * np.abs(position).max())
 
@@ -149,7 +157,8 @@ def find_orbits(geometry: Geometry, grid: VolumeGrid, rays: Rays, windowed: bool
             wanted = (-angles if s else angles) + m * math.pi / 2
             target[:, lane], reverse[:, lane] = find(wanted), s
             if rays.parallel and even:
-                # A parallel view and the one from the other side read the same lines, columns reversed.
+                # A parallel view and the one from the other side read the same lines, columns
+                # reversed.
                 other = find(wanted + math.pi)
                 swap = target[:, lane] < 0
                 target[swap, lane], reverse[swap, lane] = other[swap], 1 - s
@@ -168,7 +177,8 @@ def find_orbits(geometry: Geometry, grid: VolumeGrid, rays: Rays, windowed: bool
             chosen.append(v)
         placed = place(tuple(operations), grid)
         cost = len(chosen) * (_COST_APART if placed.apart else _COST)[len(operations)]
-        cost *= math.prod(placed.shape) / math.prod(grid.shape)  # empty voxels between the lanes' grids and the rest
+        # empty voxels between the lanes' grids and the rest
+        cost *= math.prod(placed.shape) / math.prod(grid.shape)
         if cost < best_cost:
             best_cost = cost
             best = Orbits(tuple(operations), np.array(chosen), target[chosen], reverse[chosen])
@@ -176,7 +186,8 @@ def find_orbits(geometry: Geometry, grid: VolumeGrid, rays: Rays, windowed: bool
 
 
 def address(operation: tuple[int, int], ny: int, nx: int) -> Ints:
-    """``(base, per row, per column)``: flat index in the image that the operated image reads at (row, column)."""
+    """``(base, per row, per column)``: flat index in the image that the operated image reads at
+    (row, column)."""
     m, s = operation
     index = np.arange(ny * nx).reshape(ny, nx)
     for _ in range(m):

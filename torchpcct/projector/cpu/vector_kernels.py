@@ -1,16 +1,18 @@
 # mypy: disable-error-code="assignment, call-arg"
-"""CPU kernels of per-view geometry: any source, any flat detector, slab by slab along the axis a ray crosses most.
+"""CPU kernels of per-view geometry: any source, any flat detector, slab by slab along the axis a
+ray crosses most.
 
-In every slab of voxels the cell's parallelogram is projected onto the slab's middle plane and replaced by the
-rectangle along the grid's axes that has its centre and its second moments: sides √(u² + v²) of the projected steps
-along either axis. Of an upright detector that is the parallelogram itself, and the distance-driven model of
-:mod:`~torchpcct.projector.cpu.cone_kernels`; of a turned one the corners differ, the mean and the width do not. The
-reading is the mean over the rectangle times the path through the slab, summed over slabs. A long cell that is rolled
-lies along a diagonal, which no rectangle along the axes does (aspect 20: 32 % of the peak off): its reading is the mean
-of so many parts that each part's rectangle fits.
+In every slab of voxels the cell's parallelogram is projected onto the slab's middle plane and
+replaced by the rectangle along the grid's axes that has its centre and its second moments: sides
+√(u² + v²) of the projected steps along either axis. Of an upright detector that is the
+parallelogram itself, and the distance-driven model of :mod:`~torchpcct.projector.cpu.cone_kernels`;
+of a turned one the corners differ, the mean and the width do not. The reading is the mean over the
+rectangle times the path through the slab, summed over slabs. A long cell that is rolled lies along
+a diagonal, which no rectangle along the axes does (aspect 20: 32 % of the peak off): its reading is
+the mean of so many parts that each part's rectangle fits.
 
-Forward runs in parallel over views, the adjoint over blocks of slabs, one axis after the other: no two threads write to
-one place, and every sum has a fixed order.
+Forward runs in parallel over views, the adjoint over blocks of slabs, one axis after the other: no
+two threads write to one place, and every sum has a fixed order.
 """
 
 from __future__ import annotations
@@ -31,9 +33,10 @@ NEAREST = 1e-6
 """Slabs closer to the source than this part of the way to the detector are behind it."""
 _MOST_PARTS = 256
 """Of a cell, along either step."""
-_SLOPE, _SMALL = 0.2, 0.1
-"""A rectangle along the axes will do where the footprint's mixed second moment is below so much of the geometric mean
-of the other two, or below so much of a voxel's."""
+_SLOPE = 0.2
+_SMALL = 0.1
+"""A rectangle along the axes will do where the footprint's mixed second moment is below so much of
+the geometric mean of the other two, or below so much of a voxel's."""
 _POINT = 1e-9
 """A rectangle narrower than this part of a voxel is a point."""
 _small = njit(**INNER)
@@ -69,13 +72,24 @@ def _overlap(low, high, k, width):
 
 @_small
 def _parts(pose, ray, parallel, axis, lower, spacing, shape):
-    """Parts along u and along v into which a cell is cut, so that rectangles along the axes stand for them."""
+    """Parts along u and along v into which a cell is cut, so that rectangles along the axes
+    stand for them."""
     a, b = (axis + 2) % 3, (axis + 1) % 3
     d = ray[1, axis]
-    scale = 1.0 if parallel else min(max((lower[axis] + shape[axis] * spacing[axis] / 2 - ray[0, axis]) / d, 0.0), 1.0)
+    scale = (
+        1.0
+        if parallel
+        else min(max((lower[axis] + shape[axis] * spacing[axis] / 2 - ray[0, axis]) / d, 0.0), 1.0)
+    )
     u, v = pose[2, axis] / d, pose[3, axis] / d
-    ua, ub = (pose[2, a] - ray[1, a] * u) / spacing[a] * scale, (pose[2, b] - ray[1, b] * u) / spacing[b] * scale
-    va, vb = (pose[3, a] - ray[1, a] * v) / spacing[a] * scale, (pose[3, b] - ray[1, b] * v) / spacing[b] * scale
+    ua, ub = (
+        (pose[2, a] - ray[1, a] * u) / spacing[a] * scale,
+        (pose[2, b] - ray[1, b] * u) / spacing[b] * scale,
+    )
+    va, vb = (
+        (pose[3, a] - ray[1, a] * v) / spacing[a] * scale,
+        (pose[3, b] - ray[1, b] * v) / spacing[b] * scale,
+    )
     parts_u = parts_v = 1
     while max(parts_u, parts_v) < _MOST_PARTS:
         pa, pb, qa, qb = ua / parts_u, ub / parts_u, va / parts_v, vb / parts_v
@@ -91,7 +105,8 @@ def _parts(pose, ray, parallel, axis, lower, spacing, shape):
 
 @_small
 def _cell(pose, ray, parallel, axis, lower, spacing, shape, strides, r0, r1, flat, value, gather):
-    """Add ``value`` times the cell's weights to the slabs ``r0 … r1`` of ``flat``, or (``gather``) return their sum."""
+    """Add ``value`` times the cell's weights to the slabs ``r0 … r1`` of ``flat``, or
+    (``gather``) return their sum."""
     real = flat.dtype.type
     a, b = (axis + 2) % 3, (axis + 1) % 3  # b has the smaller stride, except for axis x
     if strides[b] > strides[a]:
@@ -134,11 +149,31 @@ def _cell(pose, ray, parallel, axis, lower, spacing, shape, strides, r0, r1, fla
 
 
 @_small
-def _whole_cell(pose, i, j, ray, part, parallel, axis, lower, spacing, shape, strides, r0, r1, flat, value, gather):
-    """:func:`_cell` of all parts of the cell whose ray is in ``ray``; ``ray`` and ``part (4, 3)`` are overwritten."""
+def _whole_cell(
+    pose,
+    i,
+    j,
+    ray,
+    part,
+    parallel,
+    axis,
+    lower,
+    spacing,
+    shape,
+    strides,
+    r0,
+    r1,
+    flat,
+    value,
+    gather,
+):
+    """:func:`_cell` of all parts of the cell whose ray is in ``ray``; ``ray`` and ``part (4,
+    3)`` are overwritten."""
     parts_u, parts_v = _parts(pose, ray, parallel, axis, lower, spacing, shape)
     if parts_u * parts_v == 1:
-        return _cell(pose, ray, parallel, axis, lower, spacing, shape, strides, r0, r1, flat, value, gather)
+        return _cell(
+            pose, ray, parallel, axis, lower, spacing, shape, strides, r0, r1, flat, value, gather
+        )
     for k in range(3):
         part[0, k], part[1, k] = pose[0, k], pose[1, k]
         part[2, k], part[3, k] = pose[2, k] / parts_u, pose[3, k] / parts_v
@@ -150,7 +185,19 @@ def _whole_cell(pose, i, j, ray, part, parallel, axis, lower, spacing, shape, st
             at_j = j + (q + 0.5) / parts_u - 0.5
             _start(part, at_i * parts_v, at_j * parts_u, parallel, ray)
             total += share * _cell(
-                part, ray, parallel, axis, lower, spacing, shape, strides, r0, r1, flat, value * share, gather
+                part,
+                ray,
+                parallel,
+                axis,
+                lower,
+                spacing,
+                shape,
+                strides,
+                r0,
+                r1,
+                flat,
+                value * share,
+                gather,
             )
     return total
 
@@ -165,9 +212,23 @@ def _project_view(pose, parallel, lower, spacing, shape, strides, flat, data):
             _start(pose, at_i, at_j, parallel, ray)
             axis = _main_axis(ray, spacing)
             data[i, j] = _whole_cell(
-                pose, at_i, at_j, ray, part, parallel, axis, lower, spacing, shape, strides, 0, shape[axis], flat, 0.0,
+                pose,
+                at_i,
+                at_j,
+                ray,
+                part,
+                parallel,
+                axis,
+                lower,
+                spacing,
+                shape,
+                strides,
+                0,
+                shape[axis],
+                flat,
+                0.0,
                 True,
-            )  # fmt: skip
+            )
 
 
 @njit(nogil=True, cache=True)
@@ -177,7 +238,8 @@ def project_vectors(begin, end, poses, parallel, lower, spacing, shape, strides,
     Args:
         poses: ``(views, 4, 3)``, see :class:`torchpcct.vector_geometry.VectorGeometry`.
         parallel: whether ``poses[:, 0]`` are directions.
-        lower, spacing, shape, strides: ``(3,)`` x, y, z: lower edge and voxel size in mm, voxels, step in ``flat``.
+        lower, spacing, shape, strides: ``(3,)`` x, y, z: lower edge and voxel size in mm, voxels,
+            step in ``flat``.
         flat: the volume, flat.
         data: ``(views, rows, columns)`` output, overwritten.
     """
@@ -196,18 +258,45 @@ def _gather_slabs(poses, parallel, lower, spacing, shape, strides, data, axis, r
                 _start(poses[n], at_i, at_j, parallel, ray)
                 if _main_axis(ray, spacing) == axis:
                     _whole_cell(
-                        poses[n], at_i, at_j, ray, part, parallel, axis, lower, spacing, shape, strides, r0, r1, flat,
-                        float(data[n, i, j]), False,
-                    )  # fmt: skip
+                        poses[n],
+                        at_i,
+                        at_j,
+                        ray,
+                        part,
+                        parallel,
+                        axis,
+                        lower,
+                        spacing,
+                        shape,
+                        strides,
+                        r0,
+                        r1,
+                        flat,
+                        float(data[n, i, j]),
+                        False,
+                    )
 
 
 @njit(nogil=True, cache=True)
-def backproject_vectors(begin, end, poses, parallel, lower, spacing, shape, strides, data, axis, flat):
-    """Add the exact transpose of :func:`project_vectors` to ``flat``: rays along one axis, in blocks of its slabs."""
+def backproject_vectors(
+    begin, end, poses, parallel, lower, spacing, shape, strides, data, axis, flat
+):
+    """Add the exact transpose of :func:`project_vectors` to ``flat``: rays along one axis, in
+    blocks of its slabs."""
     for block in range(begin, end):
         r0 = block * SLAB_BLOCK
         _gather_slabs(
-            poses, parallel, lower, spacing, shape, strides, data, axis, r0, min(r0 + SLAB_BLOCK, shape[axis]), flat
+            poses,
+            parallel,
+            lower,
+            spacing,
+            shape,
+            strides,
+            data,
+            axis,
+            r0,
+            min(r0 + SLAB_BLOCK, shape[axis]),
+            flat,
         )
 
 

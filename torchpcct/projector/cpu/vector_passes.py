@@ -13,7 +13,8 @@ __all__ = ["VectorPasses"]
 
 
 class VectorPasses:
-    """Forward and adjoint passes of a scan given by vectors on arrays with one leading batch axis."""
+    """Forward and adjoint passes of a scan given by vectors on arrays with one leading batch
+    axis."""
 
     def __init__(self, tables: VectorTables) -> None:
         self.tables = tables
@@ -23,7 +24,9 @@ class VectorPasses:
         poses = np.array(g.poses)
         if grid.ndim == 2:
             poses[:, 3] = 0.0  # cells without height read the slice itself
-        spacing, center = (np.array([*v[::-1], w])[:3] for v, w in ((grid.spacing, 1.0), (grid.center, 0.0)))
+        spacing, center = (
+            np.array([*v[::-1], w])[:3] for v, w in ((grid.spacing, 1.0), (grid.center, 0.0))
+        )
         shape = np.array([nx, ny, nz], dtype=np.int64)
         lower = center - shape * spacing / 2
         strides = np.array([1, nx, nx * ny], dtype=np.int64)

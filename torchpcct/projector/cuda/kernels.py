@@ -1,9 +1,11 @@
 # mypy: ignore-errors
-"""Triton counterparts of the CPU kernels for CUDA: the same weights, gathered on both sides, so without atomics.
+"""Triton counterparts of the CPU kernels for CUDA: the same weights, gathered on both sides, so
+without atomics.
 
-Forward: one program per (view, column), lanes along the rows; it walks the slabs. Adjoint: one program per slab and
-voxels along it, lanes along z (plane: along the slab); it walks the segments, finds by bisection the columns that
-touch its voxels, and adds their overlaps. A plane is a volume of one slice without heights.
+Forward: one program per (view, column), lanes along the rows; it walks the slabs. Adjoint: one
+program per slab and voxels along it, lanes along z (plane: along the slab); it walks the segments,
+finds by bisection the columns that touch its voxels, and adds their overlaps. A plane is a volume
+of one slice without heights.
 """
 
 from __future__ import annotations
@@ -26,9 +28,29 @@ def _read(base, zeta, last):
 
 @triton.jit
 def project_kernel(
-    lines, out, cells, pose, axes, ny, nx, knots, last, views, rows, columns, z0, dz, row0, row_pitch, layer, nearest,
-    layered_below, PLANE: tl.constexpr, PARALLEL: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
+    lines,
+    out,
+    cells,
+    pose,
+    axes,
+    ny,
+    nx,
+    knots,
+    last,
+    views,
+    rows,
+    columns,
+    z0,
+    dz,
+    row0,
+    row_pitch,
+    layer,
+    nearest,
+    layered_below,
+    PLANE: tl.constexpr,
+    PARALLEL: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
     cell = tl.program_id(0)
     view = cell // columns
     column = cell % columns
@@ -36,7 +58,12 @@ def project_kernel(
     row = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     table = cells + cell * 8
     p0, q0, p1, q1 = tl.load(table), tl.load(table + 1), tl.load(table + 2), tl.load(table + 3)
-    l0, l1, path, square = tl.load(table + 4), tl.load(table + 5), tl.load(table + 6), tl.load(table + 7)
+    l0, l1, path, square = (
+        tl.load(table + 4),
+        tl.load(table + 5),
+        tl.load(table + 6),
+        tl.load(table + 7),
+    )
     axis = tl.load(axes + cell)
     source_z, foot = tl.load(pose + view * 8 + 2), tl.load(pose + view * 8 + 7)
     slabs = tl.where(axis == 0, ny, nx)
@@ -68,7 +95,11 @@ def project_kernel(
                     low = tl.floor(depth / layer)
                     for m in tl.static_range(2):
                         at = tl.where(layered, (low + m) * layer, depth)
-                        share = tl.where(layered, tl.where(m == 0, 1 - depth / layer + low, depth / layer - low), 1 - m)
+                        share = tl.where(
+                            layered,
+                            tl.where(m == 0, 1 - depth / layer + low, depth / layer - low),
+                            1 - m,
+                        )
                         at = tl.where(share > 0, at, depth)
                         step = at * row_pitch / dz
                         zeta = (source_z + at * (row0 + foot - source_z) - z0) / dz + step * row
@@ -85,13 +116,37 @@ def project_kernel(
 
 @triton.jit
 def backproject_kernel(
-    sums, out, cells, pose, segments, count, axis, slabs, width, nz, begin, views, rows, columns, z0, dz, row0,
-    row_pitch, layer, nearest, layered_below, PLANE: tl.constexpr, PARALLEL: tl.constexpr, STEPS: tl.constexpr,
-    ALONG: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
+    sums,
+    out,
+    cells,
+    pose,
+    segments,
+    count,
+    axis,
+    slabs,
+    width,
+    nz,
+    begin,
+    views,
+    rows,
+    columns,
+    z0,
+    dz,
+    row0,
+    row_pitch,
+    layer,
+    nearest,
+    layered_below,
+    PLANE: tl.constexpr,
+    PARALLEL: tl.constexpr,
+    STEPS: tl.constexpr,
+    ALONG: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
     """Add a slice of views, ``begin`` and on, to ``out``, ``(batch, slabs, width, nz)``.
 
-    ``sums``: ``(batch, views, columns, rows + 1)`` (plane: readings); ``segments``: those of the slice.
+    ``sums``: ``(batch, views, columns, rows + 1)`` (plane: readings); ``segments``: those of the
+    slice.
     """
     blocks = tl.cdiv(width, ALONG)
     r = tl.program_id(0) // blocks
@@ -110,7 +165,9 @@ def backproject_kernel(
             cells_in = tl.load(segments + s * 4 + 3)
             first = cells + (view * columns + start) * 8
             end = first + (cells_in - 1) * 8
-            rising = tl.load(end + 2) + tl.load(end + 3) * r > tl.load(first) + tl.load(first + 1) * r
+            rising = (
+                tl.load(end + 2) + tl.load(end + 3) * r > tl.load(first) + tl.load(first + 1) * r
+            )
             source_z, foot = tl.load(pose + view * 8 + 2), tl.load(pose + view * 8 + 7)
             # First column whose far edge lies beyond the voxel's near edge.
             low = tl.zeros((ALONG, 1), dtype=tl.int64)
@@ -144,10 +201,18 @@ def backproject_kernel(
                     layered = tl.abs(tl.load(here + 5)) < layered_below * layer
                     q = tl.floor(depth / layer)
                     for m in tl.static_range(2):
-                        share = tl.where(layered, tl.where(m == 0, 1 - depth / layer + q, depth / layer - q), 1 - m)
-                        at = tl.where(good, tl.where(layered & (share > 0), (q + m) * layer, depth), 1.0)
+                        share = tl.where(
+                            layered,
+                            tl.where(m == 0, 1 - depth / layer + q, depth / layer - q),
+                            1 - m,
+                        )
+                        at = tl.where(
+                            good, tl.where(layered & (share > 0), (q + m) * layer, depth), 1.0
+                        )
                         step = dz / (at * row_pitch)
-                        rho = ((z0 - source_z) / at - (row0 + foot - source_z)) / row_pitch + step * z
+                        rho = (
+                            (z0 - source_z) / at - (row0 + foot - source_z)
+                        ) / row_pitch + step * z
                         change = _read(base, rho + step, rows) - _read(base, rho, rows)
                         acc += tl.where(good, (w * share).to(acc.dtype) * change, 0.0)
                 j += 1

@@ -26,14 +26,24 @@ class GpuPasses:
         tables: of the scan.
         device: where the tables live and the passes run.
         cells, axes: of all cells, see ``cone_kernels.tabulate_cells``.
-        nearest, layers_per_slab: limits of the CPU's cone-beam kernels (``NEAREST``, ``MAX_LAYERS_PER_SLAB``).
+        nearest, layers_per_slab: limits of the CPU's cone-beam kernels (``NEAREST``,
+            ``MAX_LAYERS_PER_SLAB``).
     """
 
     def __init__(
-        self, tables: Tables, device: torch.device, cells: Any, axes: Any, nearest: float, layers_per_slab: float
+        self,
+        tables: Tables,
+        device: torch.device,
+        cells: Any,
+        axes: Any,
+        nearest: float,
+        layers_per_slab: float,
     ) -> None:
         self.tables, self.device = tables, device
-        self.cells, self.axes = torch.as_tensor(cells, device=device), torch.as_tensor(axes, device=device)
+        self.cells, self.axes = (
+            torch.as_tensor(cells, device=device),
+            torch.as_tensor(axes, device=device),
+        )
         self.pose = torch.as_tensor(tables.pose, device=device)
         self.segments = torch.as_tensor(tables.segments.table, device=device)
         self.plane = tables.grid.ndim == 2
@@ -47,7 +57,11 @@ class GpuPasses:
 
     def _budget(self) -> int | None:
         """Bytes of working memory allowed, None for no limit."""
-        return int(torch.cuda.mem_get_info(self.device)[0]) // 2 if self.device.type == "cuda" else None
+        return (
+            int(torch.cuda.mem_get_info(self.device)[0]) // 2
+            if self.device.type == "cuda"
+            else None
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         """``(batch, *domain_shape)`` to ``(batch, *range_shape)``."""
@@ -71,9 +85,25 @@ class GpuPasses:
             torch.cumsum(x.permute(0, 2, 3, 1), dim=-1, out=lines[..., 1:])
         block = 1 if self.plane else min(64, _power_of_two(rays.rows))
         project_kernel[(rays.views * rays.columns, math.ceil(rays.rows / block), batch)](
-            lines, out, self.cells, self.pose, self.axes, ny, nx, knots, knots - 1, rays.views, rays.rows,
-            rays.columns, *self.heights, self.layer, *self.limits, self.plane, rays.parallel, block,
-        )  # fmt: skip
+            lines,
+            out,
+            self.cells,
+            self.pose,
+            self.axes,
+            ny,
+            nx,
+            knots,
+            knots - 1,
+            rays.views,
+            rays.rows,
+            rays.columns,
+            *self.heights,
+            self.layer,
+            *self.limits,
+            self.plane,
+            rays.parallel,
+            block,
+        )
 
     def adjoint(self, y: Tensor) -> Tensor:
         """``(batch, *range_shape)`` to ``(batch, *domain_shape)``."""
@@ -85,12 +115,17 @@ class GpuPasses:
         return out
 
     def _adjoint_slice(self, y: Tensor, views: int) -> Tensor:
-        """The whole sum, ``views`` at a time: each voxel's sum goes on where the views before left it."""
+        """The whole sum, ``views`` at a time: each voxel's sum goes on where the views before
+        left it."""
         from torchpcct.projector.cuda.kernels import backproject_kernel  # Triton may be missing
 
         nz, ny, nx = self._shape()
         rays, batch, start = self.tables.rays, y.shape[0], self.tables.segments.start
-        along, block = (min(64, _power_of_two(max(nx, ny))), 1) if self.plane else (1, min(64, _power_of_two(nz)))
+        along, block = (
+            (min(64, _power_of_two(max(nx, ny))), 1)
+            if self.plane
+            else (1, min(64, _power_of_two(nz)))
+        )
         parts = [y.new_zeros((batch, ny, nx, nz)), y.new_zeros((batch, nx, ny, nz))]
         for begin in range(0, rays.views, views):
             stop = min(begin + views, rays.views)
@@ -103,11 +138,32 @@ class GpuPasses:
                 torch.cumsum(slanted, dim=-1, out=sums[..., 1:])
             segments = self.segments[start[begin] : start[stop]]
             for axis, (slabs, width) in enumerate(((ny, nx), (nx, ny))):
-                backproject_kernel[(slabs * math.ceil(width / along), math.ceil(nz / block), batch)](
-                    sums, parts[axis], self.cells, self.pose, segments, len(segments), axis, slabs, width, nz,
-                    begin, stop - begin, rays.rows, rays.columns, *self.heights, self.layer, *self.limits,
-                    self.plane, rays.parallel, rays.columns.bit_length() + 1, along, block,
-                )  # fmt: skip
+                backproject_kernel[
+                    (slabs * math.ceil(width / along), math.ceil(nz / block), batch)
+                ](
+                    sums,
+                    parts[axis],
+                    self.cells,
+                    self.pose,
+                    segments,
+                    len(segments),
+                    axis,
+                    slabs,
+                    width,
+                    nz,
+                    begin,
+                    stop - begin,
+                    rays.rows,
+                    rays.columns,
+                    *self.heights,
+                    self.layer,
+                    *self.limits,
+                    self.plane,
+                    rays.parallel,
+                    rays.columns.bit_length() + 1,
+                    along,
+                    block,
+                )
         total = parts[0].add_(parts[1].transpose(1, 2))
         return total[..., 0] if self.plane else total.permute(0, 3, 1, 2)
 
@@ -116,17 +172,21 @@ class GpuPasses:
         rows = torch.arange(self.tables.rays.rows, device=self.device, dtype=torch.float64)
         pose = self.pose[begin:stop]
         rise = row0 + (rows + 0.5) * pitch + (pose[:, 7] - pose[:, 2])[:, None]
-        return torch.sqrt(1.0 + rise[:, :, None] ** 2 / self.cells[begin:stop, None, :, 7]).to(dtype)
+        return torch.sqrt(1.0 + rise[:, :, None] ** 2 / self.cells[begin:stop, None, :, 7]).to(
+            dtype
+        )
 
 
 def _slice_bytes(tables: Tables, itemsize: int) -> tuple[int, int, int]:
-    """Working memory per volume: forward; adjoint; adjoint per view (also per view of a whole batch: the slants)."""
+    """Working memory per volume: forward; adjoint; adjoint per view (also per view of a whole
+    batch: the slants)."""
     rays, voxels = tables.rays, math.prod(tables.grid.shape)
     readings = rays.rows * rays.columns
     if tables.grid.ndim == 2:
         return itemsize * voxels, 2 * itemsize * voxels, itemsize * readings
     lines = voxels + voxels // tables.grid.shape[0]
-    # Running sums and a copy in their order; two partial volumes; slants, slanted readings, a copy, running sums.
+    # Running sums and a copy in their order; two partial volumes; slants, slanted readings, a copy,
+    # running sums.
     return (
         itemsize * (lines + voxels),
         2 * itemsize * voxels,
@@ -140,7 +200,8 @@ def _table_bytes(tables: Tables) -> int:
 
 
 def slices(tables: Tables, budget: int | None, batch: int, itemsize: int) -> tuple[int, int]:
-    """Volumes per launch and, for the adjoint, views at a time, so that the working memory stays within the budget.
+    """Volumes per launch and, for the adjoint, views at a time, so that the working memory stays
+    within the budget.
 
     At least one of each, whatever the budget.
     """

@@ -17,7 +17,10 @@ CTDI_HOLES = ("centre", "peripheral_0", "peripheral_90", "peripheral_180", "peri
 
 @checked
 def water_cylinder(
-    diameter: float = 200.0, length: float = math.inf, material: Any = "water", position: Any = (0.0, 0.0, 0.0)
+    diameter: float = 200.0,
+    length: float = math.inf,
+    material: Any = "water",
+    position: Any = (0.0, 0.0, 0.0),
 ) -> Scene:
     """One upright cylinder, of water by default; body ``"cylinder"``.
 
@@ -33,15 +36,19 @@ def water_cylinder(
 
 @checked
 def ctdi() -> Scene:
-    """The CTDI body phantom (IEC 60601-2-44): an acrylic cylinder of 320 mm and five bores, filled with water as the
-    paper's, one in the middle and four at the border.
+    """The CTDI body phantom (IEC 60601-2-44): an acrylic cylinder of 320 mm and five bores, filled
+    with water as the paper's, one in the middle and four at the border.
 
     Returns:
         a scene of the body ``"phantom"`` and, inside it, the bodies named in ``CTDI_HOLES``.
     """
     half, radius, hole, ring = 75.0, 160.0, 6.5, 150.0
     bodies = [Body("phantom", EllipticCylinder(radius, half), "pmma")]
-    places = [(0.0, 0.0)] + [(ring * math.cos(k * math.pi / 2), ring * math.sin(k * math.pi / 2)) for k in range(4)]
+    places = [(0.0, 0.0)] + [
+        (ring * math.cos(k * math.pi / 2), ring * math.sin(k * math.pi / 2)) for k in range(4)
+    ]
     for name, (x, y) in zip(CTDI_HOLES, places, strict=True):
-        bodies.append(Body(name, EllipticCylinder(hole, half, position=(x, y, 0.0)), "water", "phantom"))
+        bodies.append(
+            Body(name, EllipticCylinder(hole, half, position=(x, y, 0.0)), "water", "phantom")
+        )
     return Scene(bodies)

@@ -1,12 +1,15 @@
-"""An adult thorax at the height of the heart, from analytic bodies: what dose and noise studies of the chest need.
+"""An adult thorax at the height of the heart, from analytic bodies: what dose and noise studies of
+the chest need.
 
-An average adult man: body section 340 × 236 mm, skin 2 mm, subcutaneous fat 12 to 13 mm, chest wall of muscle with cut
-ribs (cortical shell, spongiosa), sternum, vertebra with arch and canal, both lungs around a mediastinum that holds
-heart, descending aorta and oesophagus. Tissues: ICRU Report 44; heart and spongiosa Woodard and White 1986. Dimensions
-are typical ones of axial CT images, chosen by us; no atlas was copied. All bodies are elliptic cylinders along z, so
-every slice is the same; ribs do not slope.
+An average adult man: body section 340 × 236 mm, skin 2 mm, subcutaneous fat 12 to 13 mm, chest wall
+of muscle with cut ribs (cortical shell, spongiosa), sternum, vertebra with arch and canal, both
+lungs around a mediastinum that holds heart, descending aorta and oesophagus. Tissues: ICRU Report
+44; heart and spongiosa Woodard and White 1986. Dimensions are typical ones of axial CT images,
+chosen by us; no atlas was copied. All bodies are elliptic cylinders along z, so every slice is the
+same; ribs do not slope.
 
-The lungs are what a wide ellipse (the rib cage's inside) holds beside its children: so they follow the mediastinum.
+The lungs are what a wide ellipse (the rib cage's inside) holds beside its children: so they follow
+the mediastinum.
 """
 
 from __future__ import annotations
@@ -21,16 +24,20 @@ from torchpcct.validate import checked, numbers
 __all__ = ["HEART_CENTER_MM", "RIB_ANGLES_DEG", "thorax"]
 
 HEART_CENTER_MM = (14.0, 34.0)
-"""Centre of the heart relative to the middle of the body's section, x to the patient's left, y to the front."""
+"""Centre of the heart relative to the middle of the body's section, x to the patient's left, y
+to the front."""
 
 RIB_ANGLES_DEG = (-58.0, -31.0, -2.0, 27.0, 54.0)
-"""Where the ribs of the left side cross the slice: polar angle on the chest wall's ellipse, 0 to the side."""
+"""Where the ribs of the left side cross the slice: polar angle on the chest wall's ellipse, 0 to
+the side."""
 
 _HEART_TILT = math.radians(-22.0)
 _WALL = (145.0, 93.5, 2.0)  # ellipse on which the ribs lie: semi-axes, y of its centre
 
 # name, semi-axes, centre (body frame), turn in degrees, material, parent
-_ELLIPSES: tuple[tuple[str, tuple[float, float], tuple[float, float], float, str, str | None], ...] = (
+_ELLIPSES: tuple[
+    tuple[str, tuple[float, float], tuple[float, float], float, str, str | None], ...
+] = (
     ("skin", (170.0, 118.0), (0.0, 0.0), 0.0, "skin", None),
     ("fat", (168.0, 116.0), (0.0, 0.0), 0.0, "adipose", "skin"),
     ("muscle", (156.0, 103.0), (0.0, 0.0), 0.0, "skeletal_muscle", "fat"),
@@ -47,7 +54,8 @@ _ELLIPSES: tuple[tuple[str, tuple[float, float], tuple[float, float], float, str
     ("sternum_marrow", (18.0, 3.8), (0.0, 95.2), 0.0, "spongiosa", "sternum"),
 )
 
-# Cavities of the heart in its own frame (x along its long axis, towards the apex at the patient's left and front).
+# Cavities of the heart in its own frame (x along its long axis, towards the apex at the patient's
+# left and front).
 _CHAMBERS = (
     ("left_ventricle", (17.0, 10.5), (23.0, -12.0)),
     ("right_ventricle", (18.0, 8.0), (15.0, 21.0)),
@@ -56,7 +64,9 @@ _CHAMBERS = (
 )
 
 
-def _cylinder(axes: tuple[float, float], center: tuple[float, float], turn: float) -> EllipticCylinder:
+def _cylinder(
+    axes: tuple[float, float], center: tuple[float, float], turn: float
+) -> EllipticCylinder:
     return EllipticCylinder(axes, position=(*center, 0.0), rotation=turn)
 
 
@@ -70,12 +80,14 @@ def thorax(
     """The thorax, by default with the heart at the isocentre.
 
     Args:
-        center: ``(x, y)`` in mm of the body section's middle. +x is the patient's left, +y the front.
+        center: ``(x, y)`` in mm of the body section's middle. +x is the patient's left, +y the
+            front.
         blood: in the chambers and the aorta; ``"blood_iodine"`` for contrast medium.
         myocardium: of the heart's walls.
 
     Returns:
-        A scene of endless cylinders: ``"skin"``, ``"fat"``, ``"muscle"``, ``"lungs"``, ``"heart"`` and its chambers,
+        A scene of endless cylinders: ``"skin"``, ``"fat"``, ``"muscle"``, ``"lungs"``, ``"heart"``
+            and its chambers,
         ``"rib_left_0"``… with ``"…_marrow"``, ``"vertebra"``, ``"sternum"`` and others.
 
     Raises:
@@ -85,10 +97,14 @@ def thorax(
     bodies = []
     for name, axes, (x, y), turn, material, parent in _ELLIPSES:
         tissue = blood if name == "aorta" else material
-        bodies.append(Body(name, _cylinder(axes, (x0 + x, y0 + y), math.radians(turn)), tissue, parent))
+        bodies.append(
+            Body(name, _cylinder(axes, (x0 + x, y0 + y), math.radians(turn)), tissue, parent)
+        )
     cos, sin = math.cos(_HEART_TILT), math.sin(_HEART_TILT)
     hx, hy = x0 + HEART_CENTER_MM[0], y0 + HEART_CENTER_MM[1]
-    bodies.append(Body("heart", _cylinder((56.0, 39.0), (hx, hy), _HEART_TILT), myocardium, "pericardium"))
+    bodies.append(
+        Body("heart", _cylinder((56.0, 39.0), (hx, hy), _HEART_TILT), myocardium, "pericardium")
+    )
     for name, axes, (along, across) in _CHAMBERS:
         place = (hx + along * cos - across * sin, hy + along * sin + across * cos)
         bodies.append(Body(name, _cylinder(axes, place, _HEART_TILT), blood, "heart"))
@@ -106,5 +122,7 @@ def _ribs(x0: float, y0: float) -> list[Body]:
             place = (x0 + sign * a * math.cos(t), y0 + lift + b * math.sin(t))
             name = f"rib_{side}_{k}"
             ribs.append(Body(name, _cylinder((13.0, 4.2), place, turn), "cortical_bone", "muscle"))
-            ribs.append(Body(f"{name}_marrow", _cylinder((12.0, 3.2), place, turn), "spongiosa", name))
+            ribs.append(
+                Body(f"{name}_marrow", _cylinder((12.0, 3.2), place, turn), "spongiosa", name)
+            )
     return ribs
