@@ -165,12 +165,8 @@ class ScanSlices:
 
     def __getstate__(self) -> dict[str, Any]:
         """For another process, which reads slabs: the file by its full path, no readings."""
-        return {
-            **self.__dict__,
-            "source": Path(self.source).resolve(),
-            "first": None,
-            "counts": None,
-        }  # type: ignore
+        source = Path(self.source).resolve()  # type: ignore[arg-type]
+        return {**self.__dict__, "source": source, "first": None, "counts": None}
 
     def _open(self, first: int, stop: int) -> Scan:
         part = slice(first, stop)
