@@ -181,7 +181,7 @@ class ObjectiveConfig:
         data: of eᵀH e.
         white: of ‖e‖², against ``data``; edge: by how much more within two voxels of an edge; body:
             in bodies and one voxel about them; flat: in bodies, where the truth is constant for
-            three voxels around, such as deep in a lumen; flat_from: share of the training after
+            two voxels around, such as deep in a lumen; flat_from: share of the training after
             which ``flat`` counts.
         noise_free: of ``data`` and ``white`` of the same scene without noise, against those with
             noise: what is left there is blur and overshoot.

@@ -49,9 +49,9 @@ _NOISE_FREE_SHARE = 0.5
 _LEAST_CONTRAST_HU = 10.0
 """Contrasts below are none: what is read there is invented."""
 _AT_ONCE = 4
-_FLAT_VOXELS = 7
+_FLAT_VOXELS = 5
 """Width of the cube in which the truth must be constant, in voxels of 0.2 mm."""
-_FLAT_HU = 1.0
+_FLAT_HU = 10.0
 """Range of the truth, in HU, that is called constant."""
 
 
@@ -234,7 +234,7 @@ class Objective:
 
 
 def _flat(truth: Tensor) -> Tensor:
-    """1 where the truth is constant for three voxels around, else 0; ``(size, z, y, x)``."""
+    """1 where the truth is constant for two voxels around, else 0; ``(size, z, y, x)``."""
     highest, lowest = truth[:, None], -truth[:, None]
     for axis in range(3):
         size, margin = [1, 1, 1], [0, 0, 0]
