@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -22,6 +22,9 @@ from torchpcct.scan_file import scan_fields, write_scan
 from torchpcct.scan_grid import grid_of
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.validate import UNITS, checked, choice, number, whole
+
+if TYPE_CHECKING:
+    from torchpcct.scanner.scanner import Scanner
 
 __all__ = ["NOISE_FREE_EXPOSURE_S", "Scan", "check_exposure"]
 
@@ -49,12 +52,12 @@ class Scan:
         surround: ``air``-shaped expected readings of every cell outside the window, the same in all
             views; given if and only if ``window`` is.
         counting: True: readings are photon counts with Poisson noise. False: an energy-integrating
-            detector's signal.
+            detector's signal, or energy bins summed with weights (:meth:`weighted`).
         info: provenance (scanner, plan, versions), JSON values.
-        quantum: energy integrating only: variance over expectation of every stored reading without
-            electronic noise, in keV (Σ s² N̄ / Σ s N̄ over the quanta that reach the detector
-            behind the object), the shape of ``counts``. None: the noise of this signal is not
-            known.
+        quantum: without Poisson noise only: variance over expectation of every stored reading
+            without electronic noise, in keV (Σ s² N̄ / Σ s N̄ over the quanta that reach the
+            detector behind the object) or, of weighted bins, in counts (Σ w² N̄ / Σ w N̄), the shape
+            of ``counts``. None: the noise of this signal is not known.
         electronic_noise: energy integrating only: standard deviation in keV that the electronics
             add to every reading, whatever the exposure.
         flux: ``(views,)`` relative intensity of the source in each view; None: the same in all.
@@ -308,6 +311,32 @@ class Scan:
             info={**self.info, "lower_dose": note},
         )
 
+    def weighted(self, weights: Any, scanner: Scanner | None = None) -> Scan:
+        """The energy bins summed with weights: one channel, which shows a contrast better than the
+        plain sum (:func:`torchpcct.spectral.bin_weights`).
+
+        The readings Σ w_k N_k are not Poisson: their variance Σ w_k² N̄_k is exact in ``quantum``,
+        of a noisy scan from the local mean of its own counts. Water reads 0 HU by a correction of
+        its own; what other materials read depends on the weights, as it does on a tube voltage.
+        FBP, PWLS, MBIR, files and :meth:`at_dose` take such a scan as any other. Noise that is
+        added afterwards (:meth:`with_noise`, :meth:`at_dose`) has the right mean and variance;
+        exact in all moments is the noise of the bins, weighted afterwards.
+
+        Args:
+            weights: ``(bins, columns)`` ≥ 0.
+            scanner: whose spectra make the water correction; None: that of weights of
+                :func:`~torchpcct.spectral.bin_weights`.
+
+        Raises:
+            ValueError: a scan without energy bins, weights of another scanner or another shape,
+                negative, not finite or all 0 in a column; no scanner; a bin that has counted
+                nothing.
+            TypeError: weights that are no numbers.
+        """
+        from torchpcct.spectral.weighting import weighted_scan  # it knows scanners, and scans
+
+        return weighted_scan(self, weights, scanner)
+
     def crop(self, window: DetectorWindow) -> Scan:
         """The same scan on a part of its window; its noise is that of the whole. A smaller one has
         no region.
@@ -499,6 +528,43 @@ class Scan:
             raise ValueError("a full scan has no surround: use line_integrals()")
         return self.linearisation.apply(torch.log(self.air) - torch.log(self.surround))
 
+    def surround_weights(self) -> Tensor:
+        """Statistical weights of :meth:`surround_line_integrals`, as if every cell were read:
+        inverse variances at the exposure of the scan, ``(rows, columns)``.
+
+        What a quantum signals is that behind the object, the mean over the views in which the cell
+        was read (of cells that were never read: over all).
+
+        Raises:
+            ValueError: the scan is not windowed, has several channels, does not hold ``quantum``,
+                or electronic noise, whose share of the variance changes with the exposure.
+        """
+        if self.surround is None or self.window is None or self.counts.ndim != 3:
+            raise ValueError("weights of the surround need a windowed scan of one channel")
+        self._require_noise_model()
+        if self.electronic_noise:
+            raise ValueError(
+                "the electronic noise of this scan does not scale with the exposure, as the "
+                "weights of an inset do: use fbp"
+            )
+        slope = self.linearisation.slope(self.air.log() - self.surround.log())
+        weights = self.surround / slope.square_()
+        return weights if self.quantum is None else weights / self._mean_per_cell(self.quantum)
+
+    def _mean_per_cell(self, readings: Tensor) -> Tensor:
+        """Mean over the views of readings ``(views, r, c)`` on the window, ``(rows, columns)``."""
+        w, g = self.window, self.geometry
+        assert w is not None
+        total = torch.zeros((w.rows, g.columns), dtype=torch.float64)
+        read = torch.zeros(g.columns, dtype=torch.float64)
+        for values, at in zip(readings, torch.from_numpy(w.column_indices), strict=True):
+            total.index_add_(-1, at, values.double())
+            read.index_add_(0, at, torch.ones(len(at), dtype=torch.float64))
+        out = torch.full((g.rows, g.columns), float(readings.double().mean()), dtype=torch.float64)
+        rows = slice(w.first_row, w.first_row + w.rows)
+        out[rows] = torch.where(read > 0, total / read.clamp(min=1.0), out[rows])
+        return out.to(readings.dtype)
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write HDF5; the file appears under its name only when it is complete."""
         write_scan(self, path)
@@ -626,7 +692,7 @@ def _check_noise_model(scan: Scan) -> None:
         return
     if scan.counting:
         raise ValueError(
-            "quantum belongs to energy-integrating scans (counting=False): counts are Poisson"
+            "quantum belongs to scans without Poisson noise (counting=False): counts are Poisson"
         )
     if scan.quantum.shape != scan.counts.shape:
         raise ValueError(

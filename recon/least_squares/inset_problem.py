@@ -53,7 +53,8 @@ class InsetProblem:
     """What all realisations of one scan on one grid share: projector, weights, Gram, background.
 
     Args:
-        scan: a counting-mode scan of the family; its noise does not matter. A scan of the whole
+        scan: a scan of the family of one channel, counts or weighted bins; its noise does not
+            matter. A scan of the whole
             detector without a known surround serves too: what lies around the grid is then found
             from its own readings, scan by scan (:mod:`recon.least_squares.surround`). Of a grid
             that holds the whole field of view see
@@ -74,8 +75,8 @@ class InsetProblem:
         model: of AᵀWA at 1 s, :func:`recon.least_squares.pwls.data_model`.
 
     Raises:
-        ValueError: a grid outside the field of view or the scan's region; a spectral or
-            energy-integrating scan.
+        ValueError: a grid outside the field of view or the scan's region; a spectral scan, or one
+            with electronic noise.
     """
 
     @undisturbed
@@ -84,10 +85,10 @@ class InsetProblem:
             raise ValueError(
                 "PWLS in HU needs a counting-mode scan; decompose or sum the energy bins before"
             )
-        if not scan.counting:
+        if scan.electronic_noise:
             raise ValueError(
-                "PWLS and MBIR weigh readings as photon counts; use fbp for an energy-integrating "
-                "scan"
+                "PWLS and MBIR of an inset weigh readings by their quantum noise; use fbp for an "
+                "energy-integrating scan with electronic noise"
             )
         self.grid, self.geometry = grid, scan.geometry
         self.prior = DEFAULT_PRIOR.stretched(length_unit(scan.geometry), grid.ndim)
@@ -107,10 +108,8 @@ class InsetProblem:
         self._background = scan.surround_line_integrals()
         # The background's own value inside the inset, from the same data by FBP.
         self.level = float(static_fbp(self._background, scan.geometry, grid).mean())
-        polychromatic = scan.air.log() - scan.surround.log()
-        slope = scan.linearisation.slope(polychromatic)
         # Per second of exposure: the Gram of one exposure serves all by a factor.
-        self._cell_weights = scan.surround / slope.square() / exposure
+        self._cell_weights = scan.surround_weights() / exposure
         self._place(None)
 
     def _start_unknown(self, scan: Scan, exposure: float) -> None:

@@ -20,9 +20,12 @@ from torchpcct.scanner.source import Slabs, Source, slabs
 from torchpcct.scene.materials import MATERIALS, Material
 from torchpcct.validate import number
 
-__all__ = ["Scanner"]
+__all__ = ["PILE_UP_ORDER", "Scanner"]
 
 Floats = NDArray[np.float64]
+
+PILE_UP_ORDER = 15
+"""Coefficients per column of a water correction with pile-up, which bends the curve more."""
 
 
 @dataclass(frozen=True)
@@ -216,8 +219,7 @@ def _linearisation(
     optics: _Optics, detector: Detector, pile_up: PileUpMap | None
 ) -> WaterLinearisation:
     energies, weights = _weights(optics, detector, False)
-    order = 7 if pile_up is None else 15  # coefficients per column: pile-up bends the curve more
-    shift = None if pile_up is None else pile_up.shift
-    return WaterLinearisation.calibrate(
-        weights.sum(0), MATERIALS["water"].attenuation(energies), order, shift
-    )
+    combined, water = weights.sum(0), MATERIALS["water"].attenuation(energies)
+    if pile_up is None:
+        return WaterLinearisation.calibrate(combined, water)
+    return WaterLinearisation.calibrate(combined, water, PILE_UP_ORDER, pile_up.shift)

@@ -1,10 +1,11 @@
 """Spectral imaging: basis materials, decomposition of energy bins, virtual monochromatic images,
-tissue maps.
+tissue maps; or the bins summed with weights.
 
 Reading order: ``basis`` (two materials instead of an attenuation at every energy) → ``model``
 (expected counts of a scanner behind them) → ``decompose`` with ``decompose_kernels`` (counts → line
 integrals of the two). What is made of the two reconstructed images: ``vmi`` (one energy) and
-``mmd`` (tissues).
+``mmd`` (tissues). Without any of these: ``weighting`` (weights per bin that show one contrast best,
+and one channel of line integrals).
 """
 
 from torchpcct.spectral.basis import Basis, pe_pvc
@@ -26,14 +27,17 @@ from torchpcct.spectral.vmi import (
     vmi_noise,
     vmi_weights,
 )
+from torchpcct.spectral.weighting import BinWeights, bin_weights, weighting_gain
 
 __all__ = [
     "MMD_TISSUES",
     "VMI_ENERGIES_KEV",
     "Basis",
+    "BinWeights",
     "Decomposition",
     "SpectralModel",
     "VmiCurve",
+    "bin_weights",
     "clean",
     "cramer_rao",
     "decompose",
@@ -48,4 +52,5 @@ __all__ = [
     "vmi_curve",
     "vmi_noise",
     "vmi_weights",
+    "weighting_gain",
 ]

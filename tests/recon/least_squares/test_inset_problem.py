@@ -75,7 +75,7 @@ def test_refusals(clean):
         whole, counts=clean.counts[None], air=clean.air[None], surround=clean.surround[None]
     )
     refused(
-        ("photon counts", lambda: InsetProblem(replace(clean, counting=False), GRID)),
+        ("energy of its quanta", lambda: InsetProblem(replace(clean, counting=False), GRID)),
         ("counting-mode", lambda: reconstruct(spectral, GRID, "pwls")),
         (
             "region",
