@@ -33,7 +33,7 @@ MADE_BY: dict[str, tuple[str, ...]] = {
         "recon/evaluate/measure.py",
         "recon/evaluate/estimates.py",
     ),
-    "reading_a_plaque.ipynb": (*_PLAQUE, *_FBP, "recon/plaque"),
+    "reading_a_plaque.ipynb": (*_PLAQUE, *_FBP, "recon/vessel"),
     "train_your_own_prior.ipynb": (
         *_PLAQUE,
         *_FBP,

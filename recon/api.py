@@ -29,9 +29,10 @@ from torchpcct.volume import Volume, from_hu
 if TYPE_CHECKING:
     from recon.least_squares.inset_problem import InsetProblem
     from recon.least_squares.qggmrf import QGGMRF
+    from recon.mbir.known import Known
     from recon.mbir.mbir import Mbir
     from recon.mbir.priors import Prior
-    from recon.plaque.vessel_prior import VesselPrior
+    from recon.vessel.prior import VesselPrior
 
 __all__ = ["METHODS", "MethodOptions", "reconstruct", "require_light"]
 
@@ -44,8 +45,23 @@ _STARVED = 0.5
 
 class MethodOptions(PwlsOptions, total=False):
     """Options of :func:`reconstruct`: ``kernel`` of FBP, ``prior``, ``problem`` and ``batch`` of
-    PWLS and MBIR, the rest of MBIR. Each is described where its method is; that of another method
-    is a ``TypeError``."""
+    PWLS and MBIR, the rest of MBIR. Each is described where its method is, or below; that of
+    another method is a ``TypeError``.
+
+    Attributes:
+        vessel: of MBIR: draw a contrast-enhanced vessel of the inset with smooth outlines, and let
+            the network reconstruct what they leave (:mod:`recon.vessel.known`); three times as
+            long. Sharper on vessels that are so, wrong on disease that has other outlines:
+            ``warnings`` say whether it was drawn, and the report holds what it changed. Where no
+            vessel is found, or its outlines do not explain the data, the volume is the one without.
+        tissues: draw the tissues' values and a core as well, at full contrast where the data prove
+            it; a few seconds a volume longer. Where they do not explain the data, the volume is the
+            one without, with a warning. The report holds under ``tissues`` what was read of them.
+        point: ``(z, y, x)`` mm where a reader sees the plaque, for ``tissues``; None: in the
+            largest vessel.
+        vessel_prior: what is believed of the vessel's tissues before the data; None: a coronary
+            artery.
+    """
 
     kernel: str
     prior: QGGMRF | Prior | str | None
@@ -56,10 +72,9 @@ class MethodOptions(PwlsOptions, total=False):
     noise_map: bool
     vessel: bool
     tissues: bool
-    point: Any
+    point: Sequence[float] | None
     vessel_prior: VesselPrior | None
-    look: float | None
-    outlines: bool | None
+    known: Known | None
 
 
 def require_light(zero_fraction: float) -> None:
@@ -115,8 +130,9 @@ def reconstruct(
             :func:`recon.least_squares.reconstruct.reconstruct_pwls`; a volume that did not converge
             carries ``warnings`` in its report) or ``"mbir"`` (unrolled steps with the learned prior
             that ships with the package, of an inset or a whole field; options of
-            :func:`recon.mbir.reconstruct.reconstruct_mbir`; what the training has not seen is named
-            in ``warnings``). Options may follow, as an evaluation has them
+            :func:`recon.mbir.reconstruct.reconstruct_mbir`, and what may be drawn of a vessel, see
+            :class:`MethodOptions`; what the training has not seen is named in ``warnings``).
+            Options may follow, as an evaluation has them
             (:mod:`recon.evaluate.methods`): ``"fbp:soft"``,
             ``"mbir:fidelity=1,prior=perona-malik"``.
         progress: called with the finished fraction, 0…1.
@@ -190,7 +206,7 @@ def reconstruct(
     scans = [s for s, _ in whole]
     for text in {text for _, texts in whole for text in texts}:
         _LOG.warning("%s", text)
-    methods: dict[str, Any] = {"fbp": _fbp, "pwls": reconstruct_pwls, "mbir": reconstruct_mbir}
+    methods: dict[str, Any] = {"fbp": _fbp, "pwls": reconstruct_pwls, "mbir": _mbir}
     volumes: list[Volume] = []
     told: set[str] = set()
     began = time.perf_counter()
@@ -261,3 +277,27 @@ def _fbp(
     for i, s in enumerate(scans):
         yield [Solution(run(s)[0][0], report, warnings)]
         progress((i + 1) / len(scans))
+
+
+def _mbir(
+    scans: Sequence[Scan],
+    grid: VolumeGrid,
+    progress: Callable[[float], None],
+    *,
+    known: Known | None = None,
+    vessel: bool = False,
+    tissues: bool = False,
+    point: Sequence[float] | None = None,
+    vessel_prior: VesselPrior | None = None,
+    **options: Any,
+) -> Iterator[list[Solution]]:
+    """MBIR, with the applications that draw what is known of the object: a vessel's outlines or
+    tissues."""
+    if vessel or tissues or point is not None or vessel_prior is not None:
+        # Loaded where somebody asks for it alone.
+        from recon.vessel.known import known_vessel
+
+        if known is not None:
+            raise TypeError("known stands beside vessel or tissues: leave out one of them")
+        known = known_vessel(vessel, tissues, point, vessel_prior)
+    return reconstruct_mbir(scans, grid, progress, known=known, **options)

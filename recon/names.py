@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from torchpcct.validate import choice, meant, number, renamed
+from torchpcct.validate import choice, meant, number
 
 __all__ = [
     "FILTERS",
@@ -77,7 +77,6 @@ def mbir_options(text: str) -> dict[str, str]:
     given: dict[str, str] = {}
     for part in filter(None, text.split(",")):
         key, _, value = part.partition("=")
-        key = renamed("mbir:look", "mbir:fidelity", "fidelity") if key == "look" else key
         given[choice("option of mbir", key, _MBIR)] = value
     if "fidelity" in given:
         number("fidelity", given["fidelity"], low=0.0, high=1.0)

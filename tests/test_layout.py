@@ -45,6 +45,15 @@ def _imports(module):
 GRAPH = {module: _imports(module) for module in MODULES}
 
 
+def _reached(package):
+    """Modules that those of a package import, themselves or through others."""
+    found, new = set(), {m for m in MODULES if f"{m}.".startswith(f"{package}.")}
+    while new:
+        found |= new
+        new = {needed for m in new for needed in GRAPH[m]} - found
+    return found
+
+
 def _level(module):
     return max(n for n, package in enumerate(UPWARDS) if f"{module}.".startswith(f"{package}."))
 
@@ -59,3 +68,9 @@ def test_no_import_points_up():
     assert not [
         (m, needed) for m, needs in GRAPH.items() for needed in needs if _level(needed) > _level(m)
     ]
+
+
+def test_mbir_knows_no_application():
+    """What MBIR may know of an object is a plug-in of its own package (:mod:`recon.mbir.known`)."""
+    assert not [m for m in _reached("recon.mbir") if m.startswith("recon.vessel")]
+    assert [m for m in _reached("recon.api") if m.startswith("recon.vessel")]

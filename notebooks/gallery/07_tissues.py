@@ -7,7 +7,7 @@ What is known of a vessel if its tissues, and not voxels, are the unknowns?
 import matplotlib.pyplot as plt
 
 from recon.least_squares.inset_problem import InsetProblem
-from recon.plaque import TissueData, read_plaque
+from recon.vessel import TissueData, read_plaque
 from torchpcct import VolumeGrid, acquire
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene

@@ -27,12 +27,12 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     check_results(arguments, folder, lambda report: "presence" in report, *names)
     from recon import reconstruct
     from recon.least_squares.inset_problem import InsetProblem
-    from recon.plaque.beside import fbp_deviations
-    from recon.plaque.data import TissueData
-    from recon.plaque.reading import read_plaque
-    from recon.plaque.report import save, table
-    from recon.plaque.start import require_within
-    from recon.plaque.vessel_prior import VesselPrior
+    from recon.vessel.data import TissueData
+    from recon.vessel.fbp_noise import fbp_deviations
+    from recon.vessel.prior import VesselPrior
+    from recon.vessel.reading import read_plaque
+    from recon.vessel.report import save, table
+    from recon.vessel.start import require_within
     from torchpcct.scan import Scan
 
     believed = VesselPrior(

@@ -834,7 +834,7 @@ def add_reconstruct(commands: Commands) -> None:
             "of FBP, from quiet to sharp: soft, standard (default), detail, bone, ram-lak",
         ),
         (
-            "--fidelity --look",
+            "--fidelity",
             float,
             "F",
             "of MBIR, from 0 (quiet) to 1 (more contrast and noise; default 0.5)",

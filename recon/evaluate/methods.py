@@ -40,11 +40,10 @@ from recon.evaluate.rivals import tuned
 from recon.filters import FILTERS, SMOOTHED_BY, deepinv_denoiser, denoiser_of, flat_noise
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import bilateral_prior
-from recon.mbir.outlines import OutlineMbir
 from recon.mbir.priors import PlugAndPlay, prior_of
-from recon.mbir.tissues import TissueMbir
 from recon.mbir.weights_io import digest
 from recon.names import filter_name, is_module_name, loaded, mbir_options
+from recon.vessel.known import known_vessel
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.volume import Volume
@@ -240,13 +239,9 @@ def _mbir(spec: str, rest: str) -> Method:
         network, key = network.with_prior(prior), f"{key} {_source_of(prior)}"
     if "fidelity" in given:
         network = network.with_fidelity(float(given["fidelity"]))
-    if "tissues" in given:
-        fitted = TissueMbir(network)
-        return Method(spec, lambda draw: draw.mbir(fitted), key=key)
-    if "vessel" in given:
-        network = OutlineMbir(network)
+    network = network.with_known(known_vessel("vessel" in given, "tissues" in given))
     # Others need not be differentiable: what is drawn of them is controlled by the reference.
-    differentiable = prior is None or prior is bilateral_prior
+    differentiable = "tissues" not in given and (prior is None or prior is bilateral_prior)
     return Method(
         spec, lambda draw: draw.mbir(network), key=key, network=network if differentiable else None
     )

@@ -5,8 +5,8 @@ Read :mod:`~recon.mbir.reconstruct` (from a scan to HU; whole fields of any scan
 weights), :mod:`~recon.mbir.problem` (the data in noise units), :mod:`~recon.mbir.unrolled` (data
 steps and network in turn) and :mod:`~recon.mbir.network` (the learned prior).
 :mod:`~recon.mbir.priors` says what may stand in that network's place: filters, denoisers, a network
-of a user's own. :mod:`~recon.mbir.outlines` puts it around the drawn outlines of a vessel, for who
-asks for that, and :mod:`~recon.mbir.tissues` adds tissue values and a core to them. Weights, their
-model card and the record of their training lie in ``weights``; :mod:`~recon.mbir.weights_io` reads
-them.
+of a user's own.
+:mod:`~recon.mbir.known` says what may be drawn before, because it is known of the object
+(:mod:`recon.vessel` draws a vessel). Weights, their model card and the record of their training lie
+in ``weights``; :mod:`~recon.mbir.weights_io` reads them.
 """

@@ -13,6 +13,7 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any, Self
@@ -22,6 +23,8 @@ import torch
 from torch import Tensor, nn
 
 from recon.least_squares.inset_problem import InsetProblem
+from recon.mbir.known import Drawn, Known
+from recon.mbir.network import Network
 from recon.mbir.priors import Prior, name_of, network_of, prior_of
 from recon.mbir.problem import NormalisedProblem
 from recon.mbir.unrolled import DEFAULT_FIDELITY, Unrolled, fidelity_frequency
@@ -49,11 +52,13 @@ class Reconstructed:
         u: ``(batch, z, y, x)`` in its units.
         notes: for each volume, what its report shall hold beside; under ``warnings`` a list of
             texts.
+        drawn: for each volume, whether something known was drawn (:mod:`recon.mbir.known`).
     """
 
     normal: NormalisedProblem
     u: Tensor
     notes: list[dict[str, Any]]
+    drawn: list[bool]
 
 
 class Mbir:
@@ -91,6 +96,7 @@ class Mbir:
         self.model = model.eval().requires_grad_(False)
         self.fidelity = fidelity
         self.parts = parts
+        self.known: Known | None = None
         self.voxel_mm = model.voxel_mm
 
     @classmethod
@@ -190,9 +196,49 @@ class Mbir:
 
     @undisturbed
     def solved(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Reconstructed:
-        """The same with what it was made of."""
+        """The same with what it was made of; with something known, what was drawn or why not."""
         normal = self.problem(problem, b, exposure_s)
-        return Reconstructed(normal, self.solution(normal), [{} for _ in range(b.shape[0])])
+        if self.known is not None:
+            return self._around(self.known, problem, b, exposure_s, normal)
+        n = b.shape[0]
+        return Reconstructed(normal, self.solution(normal), [{} for _ in range(n)], [False] * n)
+
+    def _around(
+        self,
+        known: Known,
+        problem: InsetProblem,
+        b: Tensor,
+        exposure_s: float,
+        normal: NormalisedProblem,
+    ) -> Reconstructed:
+        """Around what is known; where nothing is drawn, or what is drawn is objected to, without
+        it."""
+        found = [known.drawn(problem, own, exposure_s, self.fidelity) for own in b]
+        why = [one.why for one in found]
+        images = {k: one.image for k, one in enumerate(found) if one.image is not None}
+        volumes: dict[int, Tensor] = {}
+        if images:
+            part = normal.part(list(images))
+            t = self.in_noise_units(problem, torch.stack(list(images.values())), part)
+            # Once what is known is taken off, four turns do what eight do: 0.7 HU rms apart on
+            # the paper's plaque.
+            network = self.model.network
+            quick = (
+                {"prior": partial(network, mirrored=False)} if isinstance(network, Network) else {}
+            )
+            u = t + self.solution(replace(part, beta=part.beta - part.apply(t)), **quick)
+            hu = self.in_hu(problem, u.detach(), part)
+            for k, own, volume in zip(images, u, hu, strict=True):
+                why[k] = found[k].objection(volume)
+                if not why[k]:
+                    volumes[k] = own
+        plain = [k for k in range(len(found)) if k not in volumes]
+        if plain:
+            without = self.solution(self.problem(problem, b[plain], exposure_s))
+            volumes |= dict(zip(plain, without, strict=True))
+        u = torch.stack([volumes[k] for k in range(len(found))])
+        notes = [_note(known, *one) for one in zip(found, why, strict=True)]
+        return Reconstructed(normal, u, notes, [k not in plain for k in range(len(found))])
 
     def solution(self, normal: NormalisedProblem, **parts: Any) -> Tensor:
         """u of a normalised problem, ``(batch, z, y, x)``.
@@ -241,6 +287,15 @@ class Mbir:
         """
         other = copy.copy(self)
         other.parts = {**self.parts, "prior": _ready(prior)}
+        return other
+
+    def with_known(self, known: Known | None) -> Self:
+        """The same method around what is known of the object; None: around nothing.
+
+        A T that depends on the data is differentiable in them as far as the plug-in makes it so.
+        """
+        other = copy.copy(self)
+        other.known = known
         return other
 
     def with_fidelity(self, fidelity: float) -> Self:
@@ -338,6 +393,13 @@ def _ready(given: Prior | str) -> Prior:
     """A prior, in evaluation mode if it is a module."""
     prior = prior_of(given)
     return prior.eval() if isinstance(prior, nn.Module) else prior
+
+
+def _note(known: Known, found: Drawn, why: str) -> dict[str, Any]:
+    """What the report says of a scan in which something known was to be drawn."""
+    said = {"drawn": False, "why": why} if why else {"drawn": True}
+    text = f"no {known.name} was drawn: {why}" if why else known.caution
+    return {**found.report, known.name: said, "warnings": [*found.warnings, text]}
 
 
 def _fill(model: Unrolled, tensors: Mapping[str, Tensor]) -> None:

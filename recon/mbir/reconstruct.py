@@ -11,15 +11,12 @@ from recon.least_squares.field_problem import is_whole_field
 from recon.least_squares.inset_problem import InsetProblem
 from recon.least_squares.surround import CELL_MM, length_unit
 from recon.mbir.field import field_solutions
+from recon.mbir.known import Known
 from recon.mbir.mbir import Mbir, average_onto, working_grid
-from recon.mbir.outlines import OutlineMbir
-from recon.mbir.tissues import TissueMbir
 from recon.mbir.unrolled import low_residual
-from recon.plaque.vessel_prior import VesselPrior
 from recon.solution import RESIDUAL_TEST, Solution, tested
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
-from torchpcct.validate import renamed
 
 __all__ = ["reconstruct_mbir"]
 
@@ -40,12 +37,7 @@ def reconstruct_mbir(
     batch: int = 4,
     fidelity: float | None = None,
     noise_map: bool = False,
-    vessel: bool = False,
-    tissues: bool = False,
-    point: Any = None,
-    vessel_prior: VesselPrior | None = None,
-    look: float | None = None,
-    outlines: bool | None = None,
+    known: Known | None = None,
 ) -> Iterator[list[Solution]]:
     """Unrolled MBIR with the learned prior, of an inset or of a whole field
     (:mod:`recon.mbir.field`).
@@ -64,19 +56,8 @@ def reconstruct_mbir(
             more noise), see :mod:`recon.mbir.unrolled`; None: that of ``network``, which is 0.5
             unless it was loaded with another.
         noise_map: add an estimate of each voxel's standard deviation, ``report["noise_sd_hu"]``.
-        vessel: draw a contrast-enhanced vessel of the inset with smooth outlines, and let the
-            network reconstruct what they leave (:mod:`recon.mbir.outlines`); three times as long.
-            Sharper on vessels that are so, wrong on disease that has other outlines: ``warnings``
-            say whether it was drawn, and the report holds what it changed. Where no vessel is
-            found, or its outlines do not explain the data, the volume is the one without.
-        tissues: draw the tissues' values and a core as well (:mod:`recon.mbir.tissues`), at full
-            contrast where the data prove it; a few seconds a volume longer. Where they do not
-            explain the data, the volume is the one without, with a warning.
-        point: ``(z, y, x)`` mm where a reader sees the plaque, for ``tissues``; None: in the
-            largest vessel.
-        vessel_prior: what is believed of the vessel's tissues before the data; None: a coronary
-            artery.
-        look, outlines: the former names of ``fidelity`` and ``vessel``.
+        known: what is known of the object and drawn before, such as a vessel
+            (:mod:`recon.mbir.known`), of small insets; None: nothing, or what ``network`` knows.
 
     Yields:
         Volumes in HU, batch by batch. Report: ``iterations``, ``fidelity``, ``residual`` (what is
@@ -85,10 +66,9 @@ def reconstruct_mbir(
         :func:`recon.mbir.unrolled.low_residual`), ``chi2`` (weighted squared residual per reading),
         ``weights_sha256`` or the name of the ``prior``, of noisy scans ``residual_p``
         (:mod:`torchpcct.metrics.residual_test`: does the volume explain its data?), ``warnings``;
-        with ``vessel`` or ``tissues``, under ``vessel``, whether one was drawn (``drawn``) or
-        ``why`` not, and where it was, ``drawn_minus_plain_hu``, the difference from the volume
-        without drawing, like the volume in HU; with ``tissues`` what was read of them, under that
-        name.
+        with something ``known``, under its name, whether it was drawn (``drawn``) or ``why`` not,
+        and where it was, ``drawn_minus_plain_hu``, the difference from the volume without drawing,
+        like the volume in HU.
 
     Raises:
         ValueError, TypeError: see :class:`recon.least_squares.inset_problem.InsetProblem`; an inset
@@ -101,30 +81,19 @@ def reconstruct_mbir(
     if prior is not None:
         network = network.with_prior(prior) if network is not None else Mbir(prior=prior)
     network = network or Mbir.load()
-    if look is not None:
-        fidelity = renamed("look", "fidelity", look)
     if fidelity is not None:
         network = network.with_fidelity(fidelity)
-    if outlines is not None:
-        vessel = renamed("outlines", "vessel", outlines)
-    if point is not None and not tissues:
-        raise ValueError("point says where a plaque is: give it with tissues=True")
-    if vessel_prior is not None and not (vessel or tissues):
-        raise ValueError(
-            "vessel_prior says what a vessel is made of: give it with vessel=True or tissues=True"
-        )
+    if known is not None:
+        network = network.with_known(known)
     if problem is None and is_whole_field(scans[0], grid):
-        for name, asked in (("noise_map", noise_map), ("vessel", vessel), ("tissues", tissues)):
-            if asked:
-                raise ValueError(
-                    f"{name} needs the FFT model of a small inset: ask for a smaller grid"
-                )
+        asked = ["noise_map"] * noise_map
+        asked += [f"a drawn {network.known.name}"] if network.known is not None else []
+        if asked:
+            raise ValueError(
+                f"{asked[0]} needs the FFT model of a small inset: ask for a smaller grid"
+            )
         yield from field_solutions(scans, grid, network, progress)
         return
-    if tissues:
-        network = TissueMbir(network, point, vessel_prior=vessel_prior)
-    elif vessel:
-        network = OutlineMbir(network, vessel_prior)
     _check_cells(scans[0], network.voxel_mm)
     work = working_grid(grid, network.voxel_mm)
     problem = problem or InsetProblem(scans[0], work)
@@ -166,10 +135,10 @@ def reconstruct_mbir(
                 tests = tested(
                     RESIDUAL_TEST, warnings, problem.residual_test, scan, volume, data[k]
                 )
-            if isinstance(network, OutlineMbir) and report["vessel"]["drawn"]:
+            if solution.drawn[k]:
                 with torch.no_grad():
-                    plain = network.plain(problem, statistic.b[None], exposure)
-                    changed = volume - network.in_hu(problem, plain.u, plain.normal)[0]
+                    plain = network.with_known(None)
+                    changed = volume - plain(problem, statistic.b[None], exposure)[0]
                 report["drawn_minus_plain_hu"] = (
                     changed if work is grid else average_onto(changed, work, grid)
                 )

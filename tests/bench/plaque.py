@@ -33,9 +33,9 @@ from scipy.stats import beta, chi2
 from recon.analytic.inset import InsetFbp
 from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.mbir import Mbir
-from recon.plaque import TissueData, read_plaque
-from recon.plaque.reading import CERTAIN, read_regions
 from recon.study.paper.plaque_scan import inset_grid
+from recon.vessel import TissueData, read_plaque
+from recon.vessel.reading import CERTAIN, read_regions
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.files import atomic_write
 from torchpcct.geometry import VolumeGrid
@@ -434,7 +434,7 @@ def summary(work: Path) -> dict[str, Any]:
 
 
 def _given(draw: dict[str, Any]) -> bool:
-    """Whether the reading gives a contrast (see ``recon.plaque.reading``), or refuses it."""
+    """Whether the reading gives a contrast (see ``recon.vessel.reading``), or refuses it."""
     low, high = (draw["figures"]["contrast"][end] for end in ("low", "high"))
     return draw["presence"] >= CERTAIN and not low <= 0.0 <= high
 

@@ -23,11 +23,12 @@ import torch
 from rival_scenes import DIRECTIONS, Bench, Place
 from torch import Tensor
 
+from recon.mbir.known import Drawn
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import bilateral_prior
-from recon.mbir.outlines import Drawn, OutlineMbir
 from recon.mbir.priors import prior_of
-from recon.plaque.layer import LayerField
+from recon.vessel.known import KnownVessel
+from recon.vessel.layer import LayerField
 
 HERE = Path(__file__).parent
 DOSES = (0.35, 2.0)
@@ -42,12 +43,16 @@ def _one_orientation(network: Mbir) -> Mbir:
     return network
 
 
-class _OneLength(OutlineMbir):
+class _OneLength(KnownVessel):
     """What the layer holds is correlated over 0.5 mm in every direction."""
 
     def drawn(self, *scan: Any) -> Drawn:
         with mock.patch.object(LayerField.__init__, "__defaults__", ((0.5, 0.5, 0.5),)):
             return super().drawn(*scan)
+
+
+def _drawn(network: Mbir) -> Mbir:
+    return network.with_known(KnownVessel())
 
 
 USES: dict[str, Callable[[Mbir], Mbir]] = {
@@ -61,20 +66,22 @@ USES: dict[str, Callable[[Mbir], Mbir]] = {
         n.model, prior=prior_of("perona-malik")
     ),
     "the linear start alone": lambda n: Mbir(n.model, steps=0),
-    "around a drawn vessel": OutlineMbir,
-    "drawn, what is in the layer correlated over 0.5 mm in every direction": _OneLength,
-    "drawn, eight turns of the network instead of four": lambda n: OutlineMbir(
+    "around a drawn vessel": _drawn,
+    "drawn, what is in the layer correlated over 0.5 mm in every direction": lambda n: n.with_known(
+        _OneLength()
+    ),
+    "drawn, eight turns of the network instead of four": lambda n: _drawn(
         Mbir(n.model, prior=n.model.network)
     ),
-    "drawn, overshoot not cut off": lambda n: OutlineMbir(Mbir(n.model, cut_overshoot=False)),
-    "drawn, nothing put back": lambda n: OutlineMbir(Mbir(n.model, restore=False)),
-    "drawn, no data consistency at the end": lambda n: OutlineMbir(
+    "drawn, overshoot not cut off": lambda n: _drawn(Mbir(n.model, cut_overshoot=False)),
+    "drawn, nothing put back": lambda n: _drawn(Mbir(n.model, restore=False)),
+    "drawn, no data consistency at the end": lambda n: _drawn(
         Mbir(n.model, final_data_consistency=False)
     ),
-    "drawn, the filtered view in the network's place": lambda n: OutlineMbir(
+    "drawn, the filtered view in the network's place": lambda n: _drawn(
         Mbir(n.model, prior=bilateral_prior)
     ),
-    "drawn, Perona and Malik's filter in the network's place": lambda n: OutlineMbir(
+    "drawn, Perona and Malik's filter in the network's place": lambda n: _drawn(
         Mbir(n.model, prior=prior_of("perona-malik"))
     ),
 }

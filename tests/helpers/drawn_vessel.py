@@ -13,7 +13,7 @@ from recon.gram.gram import Gram
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import NetworkConfig
 from recon.mbir.unrolled import Unrolled
-from recon.plaque.data import TissueData
+from recon.vessel.data import TissueData
 from torchpcct import Projector, VolumeGrid
 
 VALUES = {"fat": -90.0, "wall": 50.0, "fibrous": 100.0, "lumen": 400.0}

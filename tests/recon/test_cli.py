@@ -17,8 +17,9 @@ from small_scan import GRID
 
 from recon.cli import main
 from recon.cli.parsing import as_options, saying
-from recon.mbir.outlines import Drawn, OutlineMbir
+from recon.mbir.known import Drawn
 from recon.study.results import README_MARKS
+from recon.vessel.known import KnownVessel
 from torchpcct import ConeBeam, ParallelBeam, Scan, Volume, VolumeGrid, __version__, full_turn
 from torchpcct.acquisition.config import read_config
 from torchpcct.formats.geometry_yaml import geometry_of
@@ -376,7 +377,7 @@ def test_a_scan_of_a_region_is_reconstructed_there(here, cli, clean):
 
 def test_what_a_drawn_vessel_has_changed_is_written_and_shown(here, cli, clean, monkeypatch):
     monkeypatch.setattr(
-        OutlineMbir, "drawn", lambda self, problem, b, exposure_s: Drawn(torch.zeros(b.shape), {})
+        KnownVessel, "drawn", lambda self, problem, b, *_: Drawn(torch.zeros(b.shape))
     )
     clean.with_noise(1.0, 0).save("mine.h5")
     cli("reconstruct mine.h5 --method mbir --vessel --out a.nii.gz")

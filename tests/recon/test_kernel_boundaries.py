@@ -8,7 +8,7 @@ import torch
 from recon.gram.gram import cholesky, make_definite
 from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.mbir.bilateral import joint_bilateral
-from recon.plaque.local_gram import LocalGram
+from recon.vessel.local_gram import LocalGram
 from torchpcct.acquisition.bodies import BodySet
 from torchpcct.acquisition.transmission import Beam, expected_readings
 from torchpcct.checks.defects import cell_sums

@@ -10,10 +10,11 @@ from small_scan import CENTER, GRID
 
 from recon import reconstruct
 from recon.least_squares.inset_problem import InsetProblem
+from recon.mbir.known import Drawn
 from recon.mbir.mbir import Mbir, average_onto, working_grid
 from recon.mbir.network import NetworkConfig
-from recon.mbir.outlines import Drawn, OutlineMbir
 from recon.mbir.unrolled import Unrolled, low_residual
+from recon.vessel.known import KnownVessel
 from torchpcct import Volume, VolumeGrid
 
 
@@ -193,28 +194,16 @@ def test_metal_is_outside_of_what_the_prior_knows(network):
     assert "the volume reaches 4.02 mm^-1" in texts[1]
 
 
-def test_former_names_still_work(clean, problem, network):
-    """``look``, now ``fidelity``: as an argument, in a method's name and on the command line."""
-    from recon.evaluate import method_of
-
-    now = reconstruct(clean, GRID, "mbir", network=network, problem=problem, fidelity=0.8)
-    with pytest.warns(DeprecationWarning, match="look is now called fidelity"):
-        before = reconstruct(clean, GRID, "mbir", network=network, problem=problem, look=0.8)
-    assert torch.equal(now.data, before.data)
-    with pytest.warns(DeprecationWarning, match="mbir:look is now called mbir:fidelity"):
-        assert method_of("mbir:look=0.8").network.fidelity == 0.8
-
-
 @pytest.fixture
 def always_drawn(monkeypatch):
     """Something is drawn of every scan."""
 
-    def drawn(self, problem, b, exposure_s):
+    def drawn(self, problem, b, exposure_s, fidelity):
         image = torch.full(tuple(b.shape), -90.0)
         image[2:6, 6:10, 6:10] = 60.0
-        return Drawn(image, {})
+        return Drawn(image)
 
-    monkeypatch.setattr(OutlineMbir, "drawn", drawn)
+    monkeypatch.setattr(KnownVessel, "drawn", drawn)
 
 
 def test_a_volume_says_what_was_drawn_and_what_that_changed(
@@ -234,10 +223,3 @@ def test_a_volume_says_what_was_drawn_and_what_that_changed(
     again = Volume.load(tmp_path / "v.h5").report
     assert torch.equal(again["drawn_minus_plain_hu"], changed)
     assert again["vessel"] == {"drawn": True}
-
-
-def test_the_former_name_of_vessel(clean, problem, network, always_drawn):
-    scan = clean.with_noise(2.0, 1)
-    with pytest.warns(DeprecationWarning, match="outlines is now called vessel"):
-        volume = reconstruct(scan, GRID, "mbir", network=network, problem=problem, outlines=True)
-    assert volume.report["vessel"] == {"drawn": True}

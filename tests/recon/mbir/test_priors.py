@@ -17,7 +17,6 @@ from recon.gram.gram import Gram
 from recon.mbir.field import blockwise
 from recon.mbir.mbir import WEIGHTS_FORMAT, Mbir
 from recon.mbir.network import Network, NetworkConfig, bilateral_prior
-from recon.mbir.outlines import OutlineMbir
 from recon.mbir.priors import PlugAndPlay, name_of, network_of, prior_of
 from recon.mbir.problem import NormalisedProblem
 from recon.mbir.unrolled import Unrolled, first_views, guide_noise
@@ -295,7 +294,6 @@ def test_a_filter_knows_any_noise_and_says_that_it_is_the_prior(clean, problem):
         problem=problem,
     )
     assert torch.equal(other.data, volume.data)
-    assert OutlineMbir(network).prior_name == "nlm"
 
 
 # --- weights of another network -------------------------------------------------------------------

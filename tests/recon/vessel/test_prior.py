@@ -4,9 +4,9 @@ import drawn_vessel
 import numpy as np
 import pytest
 
-from recon.plaque import VesselPrior
-from recon.plaque.start import find_vessel
-from recon.plaque.vessel import FIBROUS, WALL, Vessel
+from recon.vessel import VesselPrior
+from recon.vessel.model import FIBROUS, WALL, Vessel
+from recon.vessel.start import find_vessel
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ from scipy import ndimage
 from scipy.stats import norm
 from torch import Tensor
 
-from recon.plaque.data import TissueData
-from recon.plaque.vessel import FAT, FIBROUS, Fit, Vessel
+from recon.vessel.data import TissueData
+from recon.vessel.model import FAT, FIBROUS, Fit, Vessel
 
 __all__ = ["Leftover", "Texture", "beside", "leftover", "misfit", "scores_of", "texture"]
 
@@ -142,7 +142,7 @@ def scores_of(vessel: Vessel, fit: Fit, explained: Tensor | float = 0.0) -> Floa
     0 at the vessel's ends: where a vessel ends is no part of what is read of it.
 
     Args:
-        vessel, fit: see :class:`recon.plaque.vessel.Vessel`.
+        vessel, fit: see :class:`recon.vessel.model.Vessel`.
         explained: ``grid.shape`` HU⁻¹, G times what is known beside the fit.
     """
     scores = vessel.data.scores(residual_of(vessel, fit) - explained, _BODY_MM)

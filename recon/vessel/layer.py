@@ -26,7 +26,7 @@ from scipy.linalg import cho_solve, eigh
 from torch import Tensor
 
 from recon.conjugate_gradient import conjugate_gradient
-from recon.plaque.vessel import FAT, Fit, Vessel
+from recon.vessel.model import FAT, Fit, Vessel
 
 __all__ = ["LENGTHS_MM", "SD_HU", "LayerEstimate", "LayerField"]
 

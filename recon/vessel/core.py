@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from recon.plaque.kernels import core_fractions, sharpened
-from recon.plaque.local_gram import LocalGram
-from recon.plaque.vessel import EXCESS, Fit, Vessel
+from recon.vessel.kernels import core_fractions, sharpened
+from recon.vessel.local_gram import LocalGram
+from recon.vessel.model import EXCESS, Fit, Vessel
 from torchpcct.threads import run
 from torchpcct.validate import shaped
 
@@ -259,7 +259,7 @@ class CoreSpace:
 
     def target(self, shapes: Floats) -> tuple[Floats, Floats]:
         """Log prior and log evidence of shapes ``(m, 8)``, as
-        :func:`recon.plaque.particles.lead` takes them."""
+        :func:`recon.vessel.particles.lead` takes them."""
         prior = self.log_prior(shapes)
         log = np.zeros(len(shapes))
         allowed = np.isfinite(prior)

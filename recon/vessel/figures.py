@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.plaque.core import AXES, CAP, CENTRE, CoreSpace
-from recon.plaque.quality import Texture
-from recon.plaque.vessel import FAT, FIBROUS, LUMEN, THICKNESS, WALL, Fit, Vessel
+from recon.vessel.core import AXES, CAP, CENTRE, CoreSpace
+from recon.vessel.model import FAT, FIBROUS, LUMEN, THICKNESS, WALL, Fit, Vessel
+from recon.vessel.quality import Texture
 
 __all__ = ["Estimate", "draws_of", "estimate"]
 

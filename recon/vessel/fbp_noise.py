@@ -9,7 +9,7 @@ from typing import Any
 
 from recon.analytic.exact_noise import roi_adjoints
 from recon.analytic.inset import InsetFbp
-from recon.plaque.reading import core_regions
+from recon.vessel.reading import core_regions
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import RoiMean
 from torchpcct.scan import Scan
@@ -29,7 +29,7 @@ def fbp_deviations(scan: Scan, grid: VolumeGrid, regions: Mapping[str, Any]) -> 
         scan: windowed, its surround known, noisy or noise free (then of the exposure its readings
             stand for).
         grid: of the regions.
-        regions: name → shares of the voxels, as :attr:`recon.plaque.reading.PlaqueReading.regions`.
+        regions: name → shares of the voxels, as :attr:`recon.vessel.reading.PlaqueReading.regions`.
 
     Raises:
         ValueError: a scan of the whole detector, or of an unknown surround.

@@ -4,8 +4,8 @@ import drawn_vessel
 import numpy as np
 import pytest
 
-from recon.plaque.centreline import Centreline, follow
-from recon.plaque.start import find_vessel
+from recon.vessel.centreline import Centreline, follow
+from recon.vessel.start import find_vessel
 from torchpcct import VolumeGrid
 
 

@@ -10,7 +10,7 @@ the model, so that a layer of no thickness is estimated without bias.
 A voxel's mean, projected as a box, is averaged twice: a lumen of 2 mm on voxels of 0.2 mm then
 reads 5 HU too much. So an outline is drawn as an error function, soft enough for the voxels to hold
 it without aliasing, and what it and the operator's box average is taken off again
-(:func:`recon.plaque.kernels.sharpened`): x is what the operator takes.
+(:func:`recon.vessel.kernels.sharpened`): x is what the operator takes.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import ndtr
 
-from recon.plaque.centreline import Centreline, Coordinates
-from recon.plaque.data import TissueData
-from recon.plaque.kernels import sharpened
-from recon.plaque.local_gram import LocalGram
-from recon.plaque.outline import Outline, OutlineAt
-from recon.plaque.vessel_prior import VesselPrior
+from recon.vessel.centreline import Centreline, Coordinates
+from recon.vessel.data import TissueData
+from recon.vessel.kernels import sharpened
+from recon.vessel.local_gram import LocalGram
+from recon.vessel.outline import Outline, OutlineAt
+from recon.vessel.prior import VesselPrior
 
 __all__ = ["FAT", "FIBROUS", "LUMEN", "THICKNESS", "WALL", "Drawing", "Fit", "Start", "Vessel"]
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon.plaque.kernels import gather_block, symmetric_step
+from recon.vessel.kernels import gather_block, symmetric_step
 from torchpcct.threads import run
 from torchpcct.validate import shaped
 

@@ -8,9 +8,9 @@ import torch
 from inset_operators import problem
 
 from recon.gram.gram import Gram
-from recon.plaque.kernels import core_fractions, sharpened
-from recon.plaque.local_gram import LocalGram
-from recon.plaque.vessel import SOFT, _behind
+from recon.vessel.kernels import core_fractions, sharpened
+from recon.vessel.local_gram import LocalGram
+from recon.vessel.model import SOFT, _behind
 
 
 @pytest.mark.parametrize("radius", [0.9, 1.1, 2.3])
@@ -120,6 +120,6 @@ def test_blocks_are_the_operator(nodes):
 
 def test_too_many_voxels_are_refused(monkeypatch):
     A, w = problem(views=12, shape=(2, 5, 5))
-    monkeypatch.setattr("recon.plaque.local_gram.LARGEST", 1000)
+    monkeypatch.setattr("recon.vessel.local_gram.LARGEST", 1000)
     with pytest.raises(ValueError, match="50 voxels"):
         LocalGram.of(Gram(A, w, 1), np.argwhere(np.ones(A.domain_shape)), 1.0)

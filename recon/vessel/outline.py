@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.plaque.centreline import Coordinates
-from recon.plaque.kernels import outline_radius, outline_spread
+from recon.vessel.centreline import Coordinates
+from recon.vessel.kernels import outline_radius, outline_spread
 
 __all__ = ["Outline", "OutlineAt"]
 
@@ -61,7 +61,7 @@ class Outline:
 
     Args:
         low, high: mm.
-        orders: Fourier orders, as :class:`recon.plaque.vessel_prior.VesselPrior` has them.
+        orders: Fourier orders, as :class:`recon.vessel.prior.VesselPrior` has them.
     """
 
     low: float

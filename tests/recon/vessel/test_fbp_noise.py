@@ -8,7 +8,7 @@ from small_scan import GRID
 
 from recon.analytic.exact_noise import roi_covariance
 from recon.analytic.inset import InsetFbp
-from recon.plaque.beside import fbp_deviations
+from recon.vessel.fbp_noise import fbp_deviations
 from torchpcct.metrics.roi import RoiMean
 
 

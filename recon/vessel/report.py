@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from recon.plaque.reading import CERTAIN, PlaqueReading
+from recon.vessel.reading import CERTAIN, PlaqueReading
 from torchpcct.files import atomic_write
 from torchpcct.viz import Panel, panels
 from torchpcct.volume import Volume
@@ -44,7 +44,7 @@ def table(
         reading: to tell.
         others: name → volume in HU on the reading's grid.
         deviations: of their means, where they are known
-            (:func:`recon.plaque.beside.fbp_deviations`).
+            (:func:`recon.vessel.fbp_noise.fbp_deviations`).
     """
     sd = deviations or {}
     read = {name: reading.read(volume) for name, volume in (others or {}).items()}

@@ -11,11 +11,11 @@ import pytest
 import torch
 from scipy import ndimage
 
-from recon.plaque import read_plaque, reading
-from recon.plaque.quality import LENGTH_MM, PRIOR_VARIANCE_HU2, STRIKING, Leftover, misfit, texture
-from recon.plaque.report import save, table
-from recon.plaque.start import find_vessel
-from recon.plaque.vessel import Vessel
+from recon.vessel import read_plaque, reading
+from recon.vessel.model import Vessel
+from recon.vessel.quality import LENGTH_MM, PRIOR_VARIANCE_HU2, STRIKING, Leftover, misfit, texture
+from recon.vessel.report import save, table
+from recon.vessel.start import find_vessel
 from torchpcct.volume import Volume
 
 

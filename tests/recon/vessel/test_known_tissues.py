@@ -12,13 +12,11 @@ from refusals import refused
 from small_scan import GRID
 
 from recon import reconstruct
-from recon.mbir import tissues
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import NetworkConfig
-from recon.mbir.outlines import OutlineMbir
-from recon.mbir.tissues import TissueMbir
 from recon.mbir.unrolled import Unrolled
-from recon.plaque import TissueData, VesselPrior, read_plaque
+from recon.vessel import TissueData, VesselPrior, known, read_plaque
+from recon.vessel.known import KnownTissues, KnownVessel
 
 BALL = np.s_[2:5, 2:5, 2:5]
 """A bright thing in the fat that no tissue of the vessel is."""
@@ -43,7 +41,7 @@ def truth(drawn):
 def solved(drawn, network, fine):
     """Without and with tissues, HU, and the notes."""
     b = statistic(drawn, fine, 1)
-    method = TissueMbir(network)
+    method = network.with_known(KnownTissues())
     found = method.solved(drawn, b, 1.0)
     with torch.no_grad():
         return (
@@ -91,7 +89,7 @@ def test_the_data_are_kept(drawn, network, solved, fine):
 
 def test_without_a_vessel_it_is_the_plain_reconstruction(drawn, network):
     b = statistic(drawn, torch.full(drawn.gram.finer.shape, -90.0), 2)
-    found = TissueMbir(network).solved(drawn, b, 1.0)
+    found = network.with_known(KnownTissues()).solved(drawn, b, 1.0)
     assert torch.equal(found.u, network.solved(drawn, b, 1.0).u.detach())
     assert not found.notes[0]["tissues"]["used"]
     assert "no tissues were fitted" in found.notes[0]["warnings"][0]
@@ -99,10 +97,10 @@ def test_without_a_vessel_it_is_the_plain_reconstruction(drawn, network):
 
 @pytest.mark.extended
 def test_tissues_that_do_not_explain_the_data_are_not_used(drawn, network, fine, monkeypatch):
-    reading = tissues.read_plaque
-    monkeypatch.setattr(tissues, "read_plaque", lambda *a, **k: replace(reading(*a, **k), chi2=2.0))
+    reading = known.read_plaque
+    monkeypatch.setattr(known, "read_plaque", lambda *a, **k: replace(reading(*a, **k), chi2=2.0))
     b = statistic(drawn, fine, 1)
-    found = TissueMbir(network).solved(drawn, b, 1.0)
+    found = network.with_known(KnownTissues()).solved(drawn, b, 1.0)
     assert torch.equal(found.u, network.solved(drawn, b, 1.0).u.detach())
     assert "residual is 2.00" in found.notes[0]["warnings"][0]
 
@@ -114,10 +112,10 @@ def test_what_is_believed_of_the_vessel_reaches_the_reading(drawn, network, fine
         seen.append(vessel_prior)
         raise ValueError("seen")
 
-    monkeypatch.setattr(tissues, "read_plaque", reading)
+    monkeypatch.setattr(known, "read_plaque", reading)
     b = statistic(drawn, fine, 1)
     for believed in (None, VesselPrior(wall=(20.0, 5.0))):
-        TissueMbir(network, vessel_prior=believed).with_fidelity(1.0).solved(drawn, b, 1.0)
+        network.with_known(KnownTissues(believed)).with_fidelity(1.0).solved(drawn, b, 1.0)
     assert seen == [None, VesselPrior(wall=(20.0, 5.0))]
 
 
@@ -126,10 +124,10 @@ def test_a_core_is_drawn_as_far_as_it_is_probable(drawn, network, fine, monkeypa
     b = statistic(drawn, fine, 1)[0]
     reading = read_plaque(TissueData.of_statistic(b, drawn, 1.0))
     monkeypatch.setattr(
-        tissues, "read_plaque", lambda *arguments, **settings: replace(reading, presence=0.25)
+        known, "read_plaque", lambda *arguments, **settings: replace(reading, presence=0.25)
     )
-    around = OutlineMbir(network).drawn(drawn, b, 1.0).image
-    found = TissueMbir(network).drawn(drawn, b, 1.0).image
+    around = KnownVessel().drawn(drawn, b, 1.0, network.fidelity).image
+    found = KnownTissues().drawn(drawn, b, 1.0, network.fidelity).image
     assert torch.allclose(found, 0.25 * torch.from_numpy(reading.image) + 0.75 * around, atol=1e-3)
     assert float((around - torch.from_numpy(reading.image)).abs().max()) > 20.0
 
@@ -150,9 +148,9 @@ def test_from_a_scan(clean, problem, caplog):
 def test_another_fidelity_keeps_the_tissues_and_noise_units_are_the_inverse_of_hu(
     drawn, network, truth, fine
 ):
-    method = TissueMbir(network, (0.0, 0.0, 1.0)).with_fidelity(1.0)
-    assert isinstance(method, TissueMbir)
-    assert (method.fidelity, method.point) == (1.0, (0.0, 0.0, 1.0))
+    method = network.with_known(KnownTissues(point=(0.0, 0.0, 1.0))).with_fidelity(1.0)
+    assert isinstance(method.known, KnownTissues)
+    assert (method.fidelity, method.known.point) == (1.0, (0.0, 0.0, 1.0))
     assert network.fidelity != 1.0
     normal = network.problem(drawn, statistic(drawn, fine, 1), 1.0)
     back = method.in_hu(drawn, method.in_noise_units(drawn, truth[None], normal), normal)
@@ -165,6 +163,10 @@ def test_refusals(clean, problem):
         (
             "vessel_prior says",
             lambda: reconstruct(clean, GRID, "mbir", vessel_prior=VesselPrior(), vessel=False),
+        ),
+        (
+            "known stands beside vessel or tissues",
+            lambda: reconstruct(clean, GRID, "mbir", tissues=True, known=KnownVessel()),
         ),
         (
             "point must be 3 numbers",

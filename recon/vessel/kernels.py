@@ -159,7 +159,7 @@ def gather_block(begin, end, kernel, polynomials, there, runs, out):
 
 @njit(cache=True)
 def outline_radius(first, spline, spline_slope, wave, wave_slope, shape, r, turn, slope):
-    """Radius of an outline and its derivatives, see :class:`recon.plaque.outline.OutlineAt`.
+    """Radius of an outline and its derivatives, see :class:`recon.vessel.outline.OutlineAt`.
 
     Args:
         first: ``(n,)``; spline, spline_slope: ``(n, 4)``; wave, wave_slope: ``(n, orders)``.

@@ -9,9 +9,9 @@ import pytest
 import torch
 from drawn_vessel import INNER_MM, LUMEN_MM, VALUES, WALL_MM
 
-from recon.plaque.core import CorePrior, CoreSpace
-from recon.plaque.start import find_vessel
-from recon.plaque.vessel import FAT, FIBROUS, LUMEN, THICKNESS, Vessel
+from recon.vessel.core import CorePrior, CoreSpace
+from recon.vessel.model import FAT, FIBROUS, LUMEN, THICKNESS, Vessel
+from recon.vessel.start import find_vessel
 
 
 @pytest.fixture(scope="module")
@@ -154,7 +154,7 @@ def test_evidence_of_a_body_is_the_ratio_of_two_gaussian_integrals(vessel, fit):
 def test_data_of_a_scan_in_hu(problem, clean):
     """b and G in HU: the likelihood's mode is the least-squares volume, whatever unit it is
     written in."""
-    from recon.plaque.data import TissueData
+    from recon.vessel.data import TissueData
 
     found = TissueData.of_scan(clean, problem)
     volume = 30.0 * torch.randn(problem.grid.shape, generator=torch.Generator().manual_seed(0))

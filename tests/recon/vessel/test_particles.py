@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from recon.plaque.particles import lead
+from recon.vessel.particles import lead
 
 MEAN = np.array([1.0, -0.5, 0.3])
 SD = np.array([0.2, 0.5, 0.1])

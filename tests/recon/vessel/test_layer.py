@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from recon.plaque import layer
-from recon.plaque.layer import LENGTHS_MM, LayerEstimate, LayerField
-from recon.plaque.start import find_vessel
-from recon.plaque.vessel import Vessel
+from recon.vessel import layer
+from recon.vessel.layer import LENGTHS_MM, LayerEstimate, LayerField
+from recon.vessel.model import Vessel
+from recon.vessel.start import find_vessel
 
 
 def fitted(data):

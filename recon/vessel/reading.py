@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 from threadpoolctl import threadpool_limits
 
-from recon.plaque.core import CorePrior, CoreSpace
-from recon.plaque.data import TissueData
-from recon.plaque.figures import Estimate, draws_of, estimate
-from recon.plaque.particles import Cloud, lead
-from recon.plaque.quality import STRIKING, Leftover, beside, leftover, misfit, texture
-from recon.plaque.start import find_vessel
-from recon.plaque.vessel import FIBROUS, Fit, Vessel
-from recon.plaque.vessel_prior import VesselPrior
+from recon.vessel.core import CorePrior, CoreSpace
+from recon.vessel.data import TissueData
+from recon.vessel.figures import Estimate, draws_of, estimate
+from recon.vessel.model import FIBROUS, Fit, Vessel
+from recon.vessel.particles import Cloud, lead
+from recon.vessel.prior import VesselPrior
+from recon.vessel.quality import STRIKING, Leftover, beside, leftover, misfit, texture
+from recon.vessel.start import find_vessel
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import checked, number, numbers, whole
 
@@ -69,7 +69,7 @@ class PlaqueReading:
         third_core: what is said of one more that the data show after that: ``at_mm``,
             ``volume_mm3``, ``contrast_hu``.
         calcifications: number of calcified bodies.
-        figures: name → :class:`recon.plaque.figures.Estimate`; the core's are missing where
+        figures: name → :class:`recon.vessel.figures.Estimate`; the core's are missing where
             presence is below :data:`CERTAIN`, those of all plaque bodies where the tissues do not
             explain the data.
         refused: name → why a figure is missing.
@@ -247,7 +247,7 @@ def read_plaque(
     prior = number("prior", prior, low=0.0, high=1.0)
     if not isinstance(vessel_prior, VesselPrior | None):
         raise TypeError(
-            f"vessel_prior must be a recon.plaque.VesselPrior, got {type(vessel_prior).__name__}"
+            f"vessel_prior must be a recon.vessel.VesselPrior, got {type(vessel_prior).__name__}"
         )
     rng = np.random.default_rng(seed)
 

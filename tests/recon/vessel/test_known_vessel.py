@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from recon.mbir import outlines
-from recon.mbir.outlines import OutlineMbir
-from recon.plaque import VesselPrior
+from recon.vessel import VesselPrior, known
+from recon.vessel.known import KnownVessel
 
 EXPOSURE_S = 0.25
 
@@ -26,7 +25,7 @@ def vessel(drawn):
 def test_outlines_are_sharper_and_the_layer_keeps_what_the_data_show(drawn, network):
     truth = drawn_vessel.image(drawn.grid, 100.0)
     vessel = statistic(drawn, drawn_vessel.image(drawn.gram.finer, 100.0, samples=3), None)
-    found = OutlineMbir(network).solved(drawn, vessel, EXPOSURE_S)
+    found = network.with_known(KnownVessel()).solved(drawn, vessel, EXPOSURE_S)
     assert found.notes[0]["vessel"]["drawn"]
     plain, around = (
         network.in_hu(drawn, s.u, s.normal)[0].detach()
@@ -42,7 +41,7 @@ def test_outlines_are_sharper_and_the_layer_keeps_what_the_data_show(drawn, netw
 
 def test_without_a_vessel_it_is_the_plain_reconstruction(drawn, network):
     b = statistic(drawn, torch.full(drawn.gram.finer.shape, -90.0), 2)
-    found = OutlineMbir(network).solved(drawn, b, EXPOSURE_S)
+    found = network.with_known(KnownVessel()).solved(drawn, b, EXPOSURE_S)
     assert torch.equal(found.u, network.solved(drawn, b, EXPOSURE_S).u)
     assert "nothing stands out" in found.notes[0]["vessel"]["why"]
     assert found.notes[0]["warnings"] == [f"no vessel was drawn: {found.notes[0]['vessel']['why']}"]
@@ -57,7 +56,7 @@ def test_outlines_that_leave_something_unexplained_are_not_drawn(drawn, network)
     )
     near = (z - bright[0]) ** 2 + (y - bright[1] - 12) ** 2 + (x - bright[2]) ** 2 < 36
     b = statistic(drawn, torch.where(near, torch.tensor(900.0), image), 3)
-    found = OutlineMbir(network).solved(drawn, b, EXPOSURE_S)
+    found = network.with_known(KnownVessel()).solved(drawn, b, EXPOSURE_S)
     assert not found.notes[0]["vessel"]["drawn"]
     assert torch.equal(found.u, network.solved(drawn, b, EXPOSURE_S).u)
 
@@ -71,7 +70,7 @@ def test_what_lies_apart_from_a_vessel_does_not_speak_against_it(drawn, network)
     muscle = y - drawn_vessel.TILT * z[:, None] < -(wall + 1.2)
     beside = torch.where(muscle[:, :, None], torch.tensor(0.0), image)
     b = statistic(drawn, beside, 3)
-    found = OutlineMbir(network).solved(drawn, b, EXPOSURE_S)
+    found = network.with_known(KnownVessel()).solved(drawn, b, EXPOSURE_S)
     assert found.notes[0]["vessel"]["drawn"], found.notes[0]
     plain = network.solved(drawn, b, EXPOSURE_S)
     volumes = [network.in_hu(drawn, f.u, f.normal)[0].detach() for f in (found, plain)]
@@ -85,28 +84,29 @@ def test_a_vessel_of_what_is_no_tissue_is_not_drawn(drawn, network, values, tiss
     """Inflamed fat about a lumen, contrast agent beside a flap: both are fitted, and explain the
     data."""
     b = statistic(drawn, drawn_vessel.image(drawn.gram.finer, 0.0, samples=3, **values), 4)
-    found = OutlineMbir(network).solved(drawn, b, EXPOSURE_S)
+    found = network.with_known(KnownVessel()).solved(drawn, b, EXPOSURE_S)
     assert f"its {tissue}" in found.notes[0]["vessel"]["why"]
     assert torch.equal(found.u, network.solved(drawn, b, EXPOSURE_S).u)
 
 
 def test_scenes_of_a_batch_are_what_they_are_alone(drawn, network, vessel):
     empty = statistic(drawn, torch.full(drawn.gram.finer.shape, -90.0), 2)
-    method = OutlineMbir(network)
+    method = network.with_known(KnownVessel())
     both = method.solved(drawn, torch.cat([empty, vessel]), EXPOSURE_S)
     for k, alone in enumerate((empty, vessel)):
         assert torch.allclose(both.u[k], method.solved(drawn, alone, EXPOSURE_S).u[0], atol=2e-3)
     assert [n["vessel"]["drawn"] for n in both.notes] == [False, True]
     assert ["no vessel" in n["warnings"][0] for n in both.notes] == [True, False]
     assert "may be missing: compare" in both.notes[1]["warnings"][0]
-    assert torch.equal(
-        method.plain(drawn, vessel, EXPOSURE_S).u, network.solved(drawn, vessel, EXPOSURE_S).u
-    )
+    assert both.drawn == [False, True]
+    plain = method.with_known(None).solved(drawn, vessel, EXPOSURE_S)
+    assert torch.equal(plain.u, network.solved(drawn, vessel, EXPOSURE_S).u)
+    assert plain.drawn == [False]
 
 
 def test_it_is_differentiable_with_the_fit(drawn, network, vessel):
     """Against a finite difference of the whole method, fitted anew on both sides."""
-    method = OutlineMbir(network).with_fidelity(1.0)
+    method = network.with_known(KnownVessel()).with_fidelity(1.0)
     b = vessel.clone().requires_grad_()
     weights = torch.from_numpy(np.random.default_rng(0).standard_normal(vessel.shape)).float()
     direction = statistic(drawn, torch.full(drawn.gram.finer.shape, -910.0), 5) * 0.02
@@ -124,9 +124,8 @@ def test_more_fidelity_leaves_more_of_the_contrast_and_of_the_noise(drawn, netwo
     core = drawn_vessel.image(drawn.grid, 1000.0) < -880
     contrast, noise = [], []
     for fidelity in (0.0, 1.0):
-        method = OutlineMbir(network).with_fidelity(fidelity)
         clean, without, noisy = (
-            method.drawn(drawn, statistic(drawn, image, seed)[0], EXPOSURE_S).image
+            KnownVessel().drawn(drawn, statistic(drawn, image, seed)[0], EXPOSURE_S, fidelity).image
             for image, seed in ((images[0], None), (images[1], None), (images[1], 7))
         )
         contrast.append(float((without - clean)[core].mean()))
@@ -142,8 +141,8 @@ def test_what_is_believed_of_the_vessel_reaches_the_fit(drawn, network, vessel, 
         seen.append(prior)
         raise ValueError("seen")
 
-    monkeypatch.setattr(outlines, "Vessel", refused)
-    OutlineMbir(network, "a prior").solved(drawn, vessel, EXPOSURE_S)
+    monkeypatch.setattr(known, "Vessel", refused)
+    network.with_known(KnownVessel("a prior")).solved(drawn, vessel, EXPOSURE_S)
     assert seen == ["a prior"]
 
 
@@ -156,7 +155,8 @@ def test_all_values_moved_move_the_volume(drawn, network, vessel):
     changes = []
     for believed in (None, VesselPrior()):
         found = [
-            OutlineMbir(network, believed).solved(drawn, b, EXPOSURE_S) for b in (vessel, moved)
+            network.with_known(KnownVessel(believed)).solved(drawn, b, EXPOSURE_S)
+            for b in (vessel, moved)
         ]
         assert all(f.notes[0]["vessel"]["drawn"] for f in found)
         still, other = (network.in_hu(drawn, f.u, f.normal)[0].detach() for f in found)

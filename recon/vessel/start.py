@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from recon.plaque.centreline import Centreline, follow, sections, smooth_line
-from recon.plaque.vessel import Start
+from recon.vessel.centreline import Centreline, follow, sections, smooth_line
+from recon.vessel.model import Start
 from torchpcct.geometry import VolumeGrid
 
 __all__ = ["find_vessel", "require_within"]

@@ -9,10 +9,10 @@ from drawn_vessel import VALUES
 from refusals import refused
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from recon.plaque import TissueData, read_plaque, reading
-from recon.plaque.figures import Estimate
-from recon.plaque.reading import _doubt
-from recon.plaque.report import save, table
+from recon.vessel import TissueData, read_plaque, reading
+from recon.vessel.figures import Estimate
+from recon.vessel.reading import _doubt
+from recon.vessel.report import save, table
 
 POINT_OFF = (0.0, 0.0, drawn_vessel.CORE_OFF)
 

@@ -1,0 +1,82 @@
+"""What is known of the object before MBIR reconstructs the rest: a plug-in, see
+:meth:`recon.mbir.mbir.Mbir.with_known`.
+
+With T an image of what is known, drawn from the scan's own data,
+
+    u = T + MBIR(β − H T),
+
+so whatever T lacks comes from the data as ever, beside an edge that is no longer there to bleed
+into it. Nothing in :mod:`recon.mbir` says what T shows: :mod:`recon.vessel.known` draws a
+contrast-enhanced vessel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from torch import Tensor
+
+from recon.least_squares.inset_problem import InsetProblem
+
+__all__ = ["Drawn", "Known"]
+
+
+def _no_objection(volume: Tensor) -> str:
+    return ""
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """What is drawn of one scan.
+
+    Attributes:
+        image: T, HU ``(z, y, x)``, differentiable in the data as far as it says so; None: nothing.
+        why: nothing is drawn, for the report and its warning; empty with an image.
+        report: for the volume's report beside.
+        warnings: for the volume's report beside.
+        objection: what speaks against T, given the reconstruction around it, HU ``(z, y, x)``;
+            empty: nothing. A T that is objected to is not drawn.
+    """
+
+    image: Tensor | None
+    why: str = ""
+    report: dict[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    objection: Callable[[Tensor], str] = _no_objection
+
+    def __post_init__(self) -> None:
+        if (self.image is None) != bool(self.why):
+            raise ValueError("Drawn needs an image, or says why there is none")
+
+
+class Known(Protocol):
+    """A plug-in: draws what is known of the object into each scan.
+
+    Attributes:
+        name: what it draws, such as ``vessel``; in reports the key under which ``drawn`` and
+            ``why`` stand.
+        caution: the warning of a volume in which something was drawn.
+    """
+
+    @property
+    def name(self) -> str:
+        """See the class."""
+        ...
+
+    @property
+    def caution(self) -> str:
+        """See the class."""
+        ...
+
+    def drawn(self, problem: InsetProblem, b: Tensor, exposure_s: float, fidelity: float) -> Drawn:
+        """What is drawn of one scan.
+
+        Args:
+            problem: of the scan.
+            b: its AᵀW y, ``(z, y, x)``.
+            exposure_s: of b, s.
+            fidelity: of the reconstruction, 0 (viewing) … 1 (measuring).
+        """
+        ...
