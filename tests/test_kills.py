@@ -35,7 +35,7 @@ from pathlib import Path
 from tiny_studies import INSERT, TINY
 from recon.cli import main
 from recon.study import registry
-from recon.evaluate.store import Store
+from recon.jobs.store import Store
 out, name = sys.argv[1:]
 kind = registry.part(name).Settings if name != "evaluate" else type("", (), {})
 kind.QUICK = TINY.get(name)

@@ -4,15 +4,16 @@ Imports count wherever they stand: at the top, in a function, and for the type c
 """
 
 import ast
+import itertools
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-UPWARDS = ("torchpcct", "recon", "recon.study", "recon.cli", "train")
+PACKAGES = ("torchpcct", "recon", "train")
 
 
 def _modules():
-    for top in ("torchpcct", "recon", "train"):
+    for top in PACKAGES:
         for path in sorted((ROOT / top).rglob("*.py")):
             parts = path.relative_to(ROOT).with_suffix("").parts
             yield ".".join(parts[:-1] if parts[-1] == "__init__" else parts), path
@@ -45,32 +46,63 @@ def _imports(module):
 GRAPH = {module: _imports(module) for module in MODULES}
 
 
-def _reached(package):
-    """Modules that those of a package import, themselves or through others."""
-    found, new = set(), {m for m in MODULES if f"{m}.".startswith(f"{package}.")}
-    while new:
-        found |= new
-        new = {needed for m in new for needed in GRAPH[m]} - found
+def _drawn():
+    """The layers as CONTRIBUTING draws them, from below: package → number of its line."""
+    text = (ROOT / ".github" / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    drawing = text.partition("## Layers")[2].partition("```text\n")[2].partition("```")[0]
+    found = {}
+    for height, line in enumerate(reversed(drawing.splitlines())):
+        # Packages of one layer stand side by side; behind a single one stands what it is for.
+        names = itertools.takewhile(lambda word: word.split(".")[0] in PACKAGES, line.split())
+        found |= dict.fromkeys(names, height)
     return found
 
 
-def _level(module):
-    return max(n for n, package in enumerate(UPWARDS) if f"{module}.".startswith(f"{package}."))
+LAYERS = _drawn()
+
+
+def _package(module):
+    """What the drawing calls it: recon and train's packages by themselves, torchpcct as a whole."""
+    parts = module.split(".")
+    return ".".join(parts[:2]) if parts[0] == "recon" else parts[0]
+
+
+def _named_in_texts(path):
+    """Modules of this repository that are imported by a text: of an f-string its first part."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call) and node.args:
+            function, text = ast.unparse(node.func), node.args[0]
+            if isinstance(text, ast.JoinedStr):
+                text = text.values[0]
+            if function.split(".")[-1] in ("import_module", "__import__", "run_module"):
+                yield str(getattr(text, "value", ""))
 
 
 def test_no_import_circles():
     TopologicalSorter(GRAPH).prepare()  # raises CycleError with the modules of a circle
 
 
-def test_no_import_points_up():
-    """torchpcct ← recon ← train, and within recon the studies and the command line above all
-    else."""
+def test_the_drawing_names_all_packages():
+    assert set(LAYERS) == {_package(module) for module in MODULES}
+
+
+def test_no_import_points_up_or_sideways():
     assert not [
-        (m, needed) for m, needs in GRAPH.items() for needed in needs if _level(needed) > _level(m)
+        (module, needed)
+        for module, needs in GRAPH.items()
+        for needed in needs
+        if _package(needed) != _package(module)
+        and LAYERS[_package(needed)] >= LAYERS[_package(module)]
     ]
 
 
-def test_mbir_knows_no_application():
-    """What MBIR may know of an object is a plug-in of its own package (:mod:`recon.mbir.known`)."""
-    assert not [m for m in _reached("recon.mbir") if m.startswith("recon.vessel")]
-    assert [m for m in _reached("recon.api") if m.startswith("recon.vessel")]
+def test_no_module_is_imported_by_a_text():
+    """But by the command line, which loads what a command needs, and by the list of studies."""
+    assert not [
+        (module, text)
+        for module, path in MODULES.items()
+        for text in _named_in_texts(path)
+        if text.split(".")[0] in PACKAGES
+        and path.name != "__init__.py"
+        and not module.startswith(("recon.cli", "recon.study.registry", "torchpcct.__main__"))
+    ]

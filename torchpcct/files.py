@@ -442,7 +442,7 @@ damaged one is known."""
 
 
 def is_foreign(path: Path) -> bool:
-    """Whether something is there that is no piece (:mod:`recon.evaluate.store`), not even a
+    """Whether something is there that is no piece (:mod:`recon.jobs.store`), not even a
     damaged or older one."""
     try:
         if path.is_symlink() or not path.is_file():

@@ -409,7 +409,7 @@ class VolumeGrid:
         about the field of view, of a cone beam as high as all views see it.
 
         Args:
-            scan: a :class:`torchpcct.Scan`, or the :class:`recon.analytic.slabs.ScanSlices` of a
+            scan: a :class:`torchpcct.Scan`, or the :class:`recon.slabs.ScanSlices` of a
                 file.
             voxel: edge length in mm; None: of the region's voxels, or, of a whole detector and of a
                 region given as one voxel, of a detector cell as it is seen at the axis.

@@ -366,7 +366,7 @@ def _run_study(
     check_results(
         arguments, folder, lambda report: report.get("study") in names, "report.*", "*.png"
     )
-    from recon.evaluate.store import Pieces  # loads torch
+    from recon.jobs.store import Pieces  # loads torch
 
     start = time.perf_counter()
     report = None

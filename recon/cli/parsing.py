@@ -440,6 +440,10 @@ def add_execution(parser: Parser, dry_run: bool = True) -> None:
     )
 
 
+_WORKERS_LOAD = "recon.evaluate.experiment"
+"""What workers load while the first jobs are thought of; this process may not need it."""
+
+
 @contextmanager
 def executing(arguments: argparse.Namespace, out: Path) -> Iterator[Any]:
     """Run the jobs of a block where the options say, noted in ``OUT/jobs-DATE.log``; ``--dry-run``
@@ -452,15 +456,15 @@ def executing(arguments: argparse.Namespace, out: Path) -> Iterator[Any]:
         raise ValueError(
             "--threads K is of the workers: give --workers N or --scheduler ADDRESS with it"
         )
-    from recon.evaluate import execute
+    from recon.jobs import execute
 
     executor: Any = None
     if arguments.dry_run:
         executor = execute.Plan()
     elif arguments.workers is not None:
-        executor = execute.Processes(arguments.workers, arguments.threads)
+        executor = execute.Processes(arguments.workers, arguments.threads, _WORKERS_LOAD)
     elif arguments.scheduler:
-        executor = execute.Cluster(arguments.scheduler, arguments.threads)
+        executor = execute.Cluster(arguments.scheduler, arguments.threads, _WORKERS_LOAD)
         print(f"{executor.workers} workers, dashboard: {executor.dashboard}", file=sys.stderr)
     if executor is not None:
         executor.log = out / f"jobs-{time.strftime('%Y%m%d-%H%M%S')}.log"

@@ -499,7 +499,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         else:
             _reconstruct_elsewhere(arguments, progress)
         return
-    from recon.evaluate import execute
+    from recon.jobs import execute
 
     folder: Path | None = arguments.out
     if folder is None:
@@ -537,7 +537,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 
 def _reconstruct_elsewhere(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     """One scan as a job of the workers that were asked for."""
-    from recon.evaluate import execute
+    from recon.jobs import execute
 
     out = arguments.out or Path(f"{without_ending(arguments.scan)}_{_method(arguments)}.nii.gz")
     require_folder(out)
@@ -554,7 +554,7 @@ def _reconstruct_elsewhere(arguments: argparse.Namespace, progress: ProgressBars
 
 def _job(arguments: argparse.Namespace, scan: Path, out: str) -> Any:
     """The reconstruction of a scan into a folder's file ``out``."""
-    from recon.evaluate import execute
+    from recon.jobs import execute
 
     common = {k: v for k, v in vars(arguments).items() if k not in ("run", "warn", "scan", "out")}
     mib = 4 * scan.stat().st_size / 2**20 if scan.is_file() else 0.0
@@ -729,10 +729,10 @@ def _made(arguments: argparse.Namespace) -> dict[str, Any]:
 def _reconstruct_slabs(
     arguments: argparse.Namespace, options: dict[str, Any], progress: ProgressBars
 ) -> None:
-    """``--memory``: slab by slab (:mod:`recon.analytic.slabs`)."""
+    """``--memory``: slab by slab (:mod:`recon.slabs`)."""
     import yaml
 
-    from recon.analytic.slabs import ScanSlices, plan_slabs, reconstruct_to
+    from recon.slabs import ScanSlices, plan_slabs, reconstruct_to
     from torchpcct.formats.volume_slabs import check_slab_name
 
     check_slab_name(arguments.out)

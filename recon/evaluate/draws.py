@@ -25,8 +25,8 @@ from recon.analytic.exact_noise import roi_covariance
 from recon.analytic.inset import InsetFbp
 from recon.evaluate.methods import Method, noise_of
 from recon.evaluate.response import response, statistic_covariance
-from recon.evaluate.store import Store
 from recon.evaluate.task import Facts, Task
+from recon.jobs.store import Store
 from recon.least_squares.inset_problem import InsetProblem
 from recon.least_squares.reconstruct import TOLERANCE_HU
 from recon.mbir.mbir import Mbir

@@ -17,15 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.evaluate import execute
 from recon.evaluate.draws import Draws
 from recon.evaluate.estimates import Known, Record, records_of
-from recon.evaluate.execute import Job, Unportable
 from recon.evaluate.measure import BLOCK, Measurement, Reader, kept_as
 from recon.evaluate.methods import Method, method_of
-from recon.evaluate.store import Store
 from recon.evaluate.task import Facts, Task
 from recon.evaluate.tasks import read_task
+from recon.jobs import execute
+from recon.jobs.execute import Job, Unportable
+from recon.jobs.store import Store
 from torchpcct.files import atomic_write
 from torchpcct.validate import checked, numbers, whole
 
@@ -99,13 +99,13 @@ def evaluate(
             None: nothing is kept.
         progress: called with a text and the finished fraction of it.
         executor: where volumes are computed, any of :mod:`concurrent.futures`, best one of
-            :mod:`recon.evaluate.execute`; None: that of :func:`recon.evaluate.execute.using`, else
+            :mod:`recon.jobs.execute`; None: that of :func:`recon.jobs.execute.using`, else
             here, one after another. The figures are the same, but for times.
 
     Raises:
         ValueError, TypeError: an unknown task or method, bad values; a method whose volume has
             another shape or unit, holds NaN or is shifted.
-        recon.evaluate.execute.LeftOut: jobs that failed wherever they were tried; the others are
+        recon.jobs.execute.LeftOut: jobs that failed wherever they were tried; the others are
             kept.
     """
     n, seed = whole("n", n, LEAST), whole("seed", seed, 0)

@@ -34,8 +34,8 @@ from scipy import ndimage
 from torch import Tensor
 
 from recon.analytic.exact_noise import line_integral_variance
-from recon.evaluate.sources import source_digest
-from recon.evaluate.store import Store
+from recon.jobs.sources import source_digest
+from recon.jobs.store import Store
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.acquisition.path_lengths import tissue_path_lengths
 from torchpcct.detector_window import DetectorWindow

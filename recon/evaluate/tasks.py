@@ -18,9 +18,9 @@ from torch import Tensor
 
 from recon.evaluate.anatomies import ANATOMIES, Anatomy
 from recon.evaluate.names import TASKS
-from recon.evaluate.store import Store
 from recon.evaluate.task import BESIDE_MM, Facts, SomeViews, Task, contrast_limit
 from recon.evaluate.vessels import SHAPES, Vessel
+from recon.jobs.store import Store
 from recon.mbir.mbir import overlap
 from torchpcct import Projector, VolumeGrid
 from torchpcct.acquisition.config import configured, grid_of

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from recon.analytic.fbp import fbp
 from recon.evaluate.experiment import evaluate
-from recon.evaluate.store import Pieces
 from recon.evaluate.tasks import read_task
+from recon.jobs.store import Pieces
 from recon.study.paper import facts as paper
 from recon.study.report import Check, around
 from recon.study.study import Measured, Progress, StudySettings, silent

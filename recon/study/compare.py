@@ -17,8 +17,8 @@ import torch
 
 from recon.evaluate.experiment import Evaluation, evaluate
 from recon.evaluate.report import plain, task_sections
-from recon.evaluate.store import Pieces
 from recon.evaluate.tasks import read_task
+from recon.jobs.store import Pieces
 from recon.study.figures import extent
 from recon.study.paper import facts as paper
 from recon.study.study import Measured, Progress, StudySettings, silent

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon.evaluate.store import Pieces
+from recon.jobs.store import Pieces
 from recon.study.report import Check
 from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.scanner import Scanner, SiliconDetector, presets

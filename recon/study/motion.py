@@ -24,7 +24,7 @@ import numpy as np
 from torch import Tensor
 
 from recon.analytic.inset import view_motion
-from recon.evaluate.store import Pieces
+from recon.jobs.store import Pieces
 from recon.least_squares.inset_problem import InsetProblem
 from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.mbir.mbir import Mbir

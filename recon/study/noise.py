@@ -28,7 +28,7 @@ from scipy import stats
 from torch import Tensor
 
 from recon.analytic.exact_noise import roi_adjoints
-from recon.evaluate.store import Pieces
+from recon.jobs.store import Pieces
 from recon.study.figures import extent, roi_outlines
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import (

@@ -27,7 +27,7 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from recon.analytic.exact_noise import roi_covariance
-from recon.evaluate.store import Pieces
+from recon.jobs.store import Pieces
 from recon.study.figures import curve_axes, middle_panel, plaque_panel
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import (

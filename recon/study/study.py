@@ -6,7 +6,7 @@ A study is a module (or a package that exports the same names) of :mod:`recon.st
 * ``Settings(StudySettings)``, a frozen dataclass that validates itself;
 * ``measure(settings, progress=silent, folder=None) -> Measured``, which simulates, reconstructs and
   measures. It prints nothing and writes nothing, but finished pieces into ``folder``
-  (:mod:`recon.evaluate.store`), so that an interrupted study goes on;
+  (:mod:`recon.jobs.store`), so that an interrupted study goes on;
 * ``figures(measured)``: file name → picture of the report;
 * ``checks(data)``, where there is something to check: the report's figures beside the paper's;
 * ``templates/NAME.md.j2``: the report's text, a template that :mod:`recon.study.report` fills in

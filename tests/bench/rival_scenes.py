@@ -17,8 +17,8 @@ from scipy import ndimage
 from torch import Tensor
 
 from recon.analytic.inset import InsetFbp
-from recon.evaluate.store import Store
 from recon.evaluate.vessels import Centreline, Vessel
+from recon.jobs.store import Store
 from recon.least_squares.inset_problem import InsetProblem
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct import Projector, VolumeGrid

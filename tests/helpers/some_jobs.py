@@ -1,4 +1,4 @@
-"""Jobs for tests of recon.evaluate.execute, which other processes import."""
+"""Jobs for tests of recon.jobs.execute, which other processes import."""
 
 import errno
 import importlib
@@ -10,7 +10,7 @@ import time
 
 from numba import njit
 
-from recon.evaluate import execute
+from recon.jobs import execute
 from torchpcct.files import atomic_write
 
 

@@ -23,7 +23,7 @@ from fresh_python import run_python
 from recon.cli import _parser
 from recon.cli.parsing import check_limits
 from recon.cli.scans import _length
-from recon.evaluate.store import Store
+from recon.jobs.store import Store
 from recon.study import registry
 from torchpcct import ParallelBeam, Scan, Volume, VolumeGrid
 from torchpcct.files import _part, atomic_write, require_writable
@@ -217,7 +217,7 @@ def test_a_scan_alone_is_given_to_the_workers_that_were_asked_for(here, lines, c
     assert [p.name for p in here.iterdir()] == ["one.h5"]
     asked = []
     monkeypatch.setattr(
-        "recon.evaluate.execute.Processes", lambda *n: asked.append(n) or ThreadPoolExecutor(1)
+        "recon.jobs.execute.Processes", lambda *n: asked.append(n[:2]) or ThreadPoolExecutor(1)
     )
     assert "one_fbp.nii.gz: 1 × " in cli("reconstruct one.h5 --workers 3 --threads 2")
     assert asked == [(3, 2)]

@@ -226,8 +226,8 @@ for name in ("fcntl", "resource", "pwd", "grp", "termios"):
 for name in ("getuid", "fork", "sysconf", "sync", "sched_getaffinity"):
     delattr(os, name)
 import recon.cli, recon.study.registry as registry
-from recon.evaluate import execute
-from recon.evaluate.execute import _compiling
+from recon.jobs import execute
+from recon.jobs.execute import _compiling
 for name in registry.STUDIES:
     registry.part(name)
 with _compiling(False) as seconds:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from fresh_python import run_python
 
-from recon.evaluate.store import Store
+from recon.jobs.store import Store
 from torchpcct.files import WriteError, atomic_write, write_hdf5
 
 FULL = """
@@ -19,7 +19,7 @@ import os, resource, sys
 from pathlib import Path
 import h5py, numpy as np, torch
 from recon.mbir.weights_io import write_tensors
-from recon.evaluate.store import Store
+from recon.jobs.store import Store
 from torchpcct import ConeBeam, Scan, Volume, VolumeGrid, full_turn
 from torchpcct.files import write_hdf5
 folder, rng = Path(sys.argv[1]), np.random.default_rng(0)

@@ -20,8 +20,8 @@ import numpy as np
 import torch
 
 from recon import reconstruct
-from recon.evaluate.execute import heard
-from recon.evaluate.store import Pieces
+from recon.jobs.execute import heard
+from recon.jobs.store import Pieces
 from recon.study.hardcases.cases import (
     CASES,
     CONE_GRID,

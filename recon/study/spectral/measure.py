@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from recon.analytic.exact_noise import functional_covariance
-from recon.evaluate.store import Pieces
+from recon.jobs.store import Pieces
 from recon.least_squares.basis_problem import BasisProblem
 from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.study.figures import extent

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from recon.analytic.inset import InsetFbp
-from recon.evaluate.store import Pieces
+from recon.jobs.store import Pieces
 from recon.study.paper.plaque_scan import duty, inset_grid
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.detector_window import footprint

@@ -11,9 +11,9 @@ from scipy import ndimage
 
 from recon.evaluate.anatomies import ANATOMIES, TISSUES_HU, anatomy
 from recon.evaluate.names import TASKS
-from recon.evaluate.store import Store
 from recon.evaluate.task import Facts
 from recon.evaluate.tasks import AnatomyTask, read_task
+from recon.jobs.store import Store
 from torchpcct import Projector, VolumeGrid
 from torchpcct.scene.raster import label_fractions
 from torchpcct.scene.scene import voxel_centres

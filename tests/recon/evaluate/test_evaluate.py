@@ -22,9 +22,9 @@ from recon.evaluate.methods import Method, deepinv_denoiser, denoiser, method_of
 from recon.evaluate.names import TASKS
 from recon.evaluate.report import COLUMNS, save, text_of
 from recon.evaluate.rivals import tuned
-from recon.evaluate.store import Store
 from recon.evaluate.tasks import AnatomyTask, VesselTask, read_task, task_text
 from recon.evaluate.without_truth import evaluate_scans, evaluate_volumes
+from recon.jobs.store import Store
 from torchpcct import Volume
 from torchpcct.geometry import VolumeGrid
 

@@ -17,6 +17,8 @@ __all__ = ["source_digest"]
 
 _DATA = ("weights/*.safetensors", "*.json")
 """Files that modules of a folder read."""
+_ROOT = Path(__file__).parents[2]
+"""That the packages of this software lie in."""
 
 
 @functools.cache
@@ -38,10 +40,7 @@ def source_digest(*modules: str) -> str:
             Path(found[0]) for found in (_source(name) for name, _ in seen) if found is not None
         }
     else:
-        files = {
-            Path(str(importlib.import_module(package).__file__))
-            for package in ("torchpcct", "recon")
-        }
+        files = {_ROOT / package / "__init__.py" for package in ("torchpcct", "recon")}
         endings = "**/*.py", *(f"**/{ending}" for ending in _DATA)
     files |= {
         found
@@ -49,9 +48,8 @@ def source_digest(*modules: str) -> str:
         for ending in endings
         for found in folder.glob(ending)
     }
-    roots = Path(str(importlib.import_module("torchpcct").__file__)).parent.parent
     for path in sorted(files):
-        total.update(path.relative_to(roots).as_posix().encode() + _content(path))
+        total.update(path.relative_to(_ROOT).as_posix().encode() + _content(path))
     return total.hexdigest()
 
 

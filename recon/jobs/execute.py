@@ -1,6 +1,6 @@
 """Jobs in other processes and on other machines, through any :class:`concurrent.futures.Executor`.
 
-A job computes files of a folder (pieces of a :class:`~recon.evaluate.store.Store`, volumes);
+A job computes files of a folder (pieces of a :class:`~recon.jobs.store.Store`, volumes);
 afterwards the one program that everybody knows reads them and goes on, as if it had computed them
 itself before it was interrupted. So what comes out does not depend on where it was computed, and
 whatever dies, nothing finished is lost.
@@ -50,7 +50,7 @@ from pathlib import Path
 from tempfile import gettempdir
 from typing import Any
 
-from recon.evaluate.sources import source_digest
+from recon.jobs.sources import source_digest
 from torchpcct.files import VERSION, WriteError, atomic_write, is_foreign, marker
 from torchpcct.kernel_cache import compiled_once
 from torchpcct.validate import whole
@@ -195,9 +195,10 @@ class Processes(ThreadPoolExecutor):
     Args:
         workers: number of processes.
         threads: of each; None: they share the cores.
+        preload: a module that is slow to load and that the jobs need: processes load it at once.
     """
 
-    def __init__(self, workers: int, threads: int | None = None) -> None:
+    def __init__(self, workers: int, threads: int | None = None, preload: str = "") -> None:
         self.workers = whole("workers", workers)
         self.threads = whole("threads", threads or max(1, (os.cpu_count() or 1) // workers))
         super().__init__(workers)
@@ -205,7 +206,7 @@ class Processes(ThreadPoolExecutor):
         self._ended = False
         # all of them load what is slow to load, while the first jobs are thought of
         for _ in range(workers):
-            self.submit(_load)
+            self.submit(_load, preload)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """See :class:`concurrent.futures.Executor`; ``BrokenProcessPool`` is the death of this
@@ -266,8 +267,9 @@ class Processes(ThreadPoolExecutor):
             pool.shutdown(wait, cancel_futures=cancel_futures)
 
 
-def _load() -> None:
-    importlib.import_module("recon.evaluate.experiment")
+def _load(module: str) -> None:
+    if module:
+        importlib.import_module(module)
     # of all files as they are loaded: what is installed while a worker runs, it does not have
     source_digest()
 
@@ -337,13 +339,14 @@ class Cluster(Executor):
     Args:
         scheduler: its address, or the file of ``dask scheduler --scheduler-file``.
         threads: of each worker.
+        preload: a module that is slow to load and that the jobs need: workers load it at once.
 
     Raises:
         ImportError: ``distributed`` is not installed.
         OSError: no scheduler answers.
     """
 
-    def __init__(self, scheduler: str, threads: int | None = None) -> None:
+    def __init__(self, scheduler: str, threads: int | None = None, preload: str = "") -> None:
         try:
             from distributed import Client, fire_and_forget
         except ImportError as error:
@@ -375,7 +378,7 @@ class Cluster(Executor):
         self.dumps = dumps
         for address in self._addresses:
             first = self.client.submit(
-                _load, workers=[address], allow_other_workers=True, pure=False
+                _load, preload, workers=[address], allow_other_workers=True, pure=False
             )
             # not kept: a worker that dies would lose it, and nobody needs it
             fire_and_forget(first)

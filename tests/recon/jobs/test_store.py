@@ -15,9 +15,9 @@ import torch
 from fresh_python import run_python
 from tiny_studies import run_tiny
 
-import recon.evaluate.store as store_module
-from recon.evaluate import execute
-from recon.evaluate.store import Pieces, Store, packed, unpacked
+import recon.jobs.store as store_module
+from recon.jobs import execute
+from recon.jobs.store import Pieces, Store, packed, unpacked
 from recon.study.noise import Table
 from recon.study.results import differences
 from torchpcct import ConeBeam, VolumeGrid, full_turn
@@ -226,7 +226,7 @@ _KILLED = """
 import os, signal, sys
 from pathlib import Path
 from tiny_studies import run_tiny
-from recon.evaluate.store import Pieces
+from recon.jobs.store import Pieces
 left, keep = int(sys.argv[2]), Pieces.__call__
 def call(self, name, compute):
     def dying():

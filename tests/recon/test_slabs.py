@@ -18,8 +18,8 @@ from fresh_python import run_python
 from refusals import refused
 
 import recon
-from recon.analytic import slabs
-from recon.analytic.slabs import ScanSlices, plan_slabs, reconstruct_to
+from recon import slabs
+from recon.slabs import ScanSlices, plan_slabs, reconstruct_to
 from torchpcct import (
     ConeBeam,
     FanBeam,
@@ -420,7 +420,7 @@ LIMITED = """
 import resource, sys
 resource.setrlimit(resource.RLIMIT_DATA, (10**9, 10**9))
 from torchpcct import VolumeGrid
-from recon.analytic.slabs import reconstruct_to
+from recon.slabs import reconstruct_to
 reconstruct_to(sys.argv[1], VolumeGrid((512, 512, 512), 0.155), sys.argv[2], memory="850MB")
 # Not ru_maxrss, which begins with the memory of the process that started this one.
 print(next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM")))

@@ -36,15 +36,15 @@ from some_jobs import (
 from some_jobs import threads as threads_of
 from tiny_studies import INSERT, TINY
 
-from recon.analytic.slabs import reconstruct_to
 from recon.cli import main
 from recon.cli.parsing import Ended, ending_by_signals
-from recon.evaluate import execute
-from recon.evaluate.execute import Cluster, Job, LeftOut, Processes, run
 from recon.evaluate.experiment import evaluate
 from recon.evaluate.methods import Method, method_of
-from recon.evaluate.sources import _content, _follow, source_digest
 from recon.evaluate.tasks import read_task
+from recon.jobs import execute
+from recon.jobs.execute import Cluster, Job, LeftOut, Processes, run
+from recon.jobs.sources import _content, _follow, source_digest
+from recon.slabs import reconstruct_to
 from recon.study import registry
 from recon.study.results import differences
 from torchpcct import ConeBeam, Scan, Volume, VolumeGrid, full_turn
@@ -650,7 +650,7 @@ import sys
 sys.path[:0] = {path!r}
 from pathlib import Path
 from some_jobs import noted
-from recon.evaluate.execute import Cluster, Job, run
+from recon.jobs.execute import Cluster, Job, run
 cluster = Cluster(sys.argv[sys.argv.index("--scheduler") + 1])
 while not cluster.workers:
     pass
@@ -713,8 +713,8 @@ import pickle, sys
 from pathlib import Path
 from recon.evaluate.draws import Draws
 from recon.evaluate.measure import Measurement, Reader
-from recon.evaluate.sources import _follow
-from recon.evaluate.store import Store
+from recon.jobs.sources import _follow
+from recon.jobs.store import Store
 seen, called = set(), set()
 _follow("recon.evaluate.measure", "", seen)
 known = {name for name, _ in seen}

@@ -4,7 +4,7 @@ written at once.
 Of a cone beam a slab needs the detector rows of its footprint, of a stack of parallel or fan-beam
 slices those slices. What decides about the whole (whether the rows end inside the object, how many
 readings are dead) is found in a first pass over the scan; every slab then gets the same bits as in
-one piece. Slabs do not need each other, so that the workers of :mod:`recon.evaluate.execute` may
+one piece. Slabs do not need each other, so that the workers of :mod:`recon.jobs.execute` may
 make them, each within the limit.
 """
 
@@ -36,9 +36,9 @@ from recon.analytic.coverage import check_rows, consistency_warnings, sampling_w
 from recon.analytic.detector_edges import Rows, continued, ends_cut_off, mirrored, row_ends
 from recon.analytic.fbp import filter_sinogram, read_window
 from recon.api import reconstruct, require_light
-from recon.evaluate import execute
-from recon.evaluate.sources import source_digest
-from recon.evaluate.store import Store
+from recon.jobs import execute
+from recon.jobs.sources import source_digest
+from recon.jobs.store import Store
 from recon.least_squares.memory import available_bytes, pwls_bytes, resident_bytes
 from recon.least_squares.qggmrf import QGGMRF
 from recon.metal import metal_warnings
@@ -493,7 +493,7 @@ def reconstruct_to(
     The same as :func:`recon.reconstruct` and :meth:`torchpcct.volume.Volume.save`, to the bit on
     one thread. FBP (FDK) of parallel, fan and cone beams on a circle, PWLS of stacks of slices. If
     it is interrupted, the finished slabs stay in ``path.unfinished``, and the same call goes on
-    with them. Within :func:`recon.evaluate.execute.using` the slabs of a file are jobs: each worker
+    with them. Within :func:`recon.jobs.execute.using` the slabs of a file are jobs: each worker
     keeps to ``memory``, reads the file under its full path, and this process puts the slabs into
     the volume.
 
@@ -524,7 +524,7 @@ def reconstruct_to(
         ValueError: a limit that is too small, naming the smallest that works; a scan, grid or
             method that cannot be done in slabs; a starved scan; another ending.
         WriteError: the target cannot be written (a full disk): the finished slabs stay.
-        recon.evaluate.execute.LeftOut: slabs whose workers died; the others stay.
+        recon.jobs.execute.LeftOut: slabs whose workers died; the others stay.
     """
     check_slab_name(path)
     source = scan if isinstance(scan, ScanSlices) else ScanSlices(scan, **dict(reader or {}))

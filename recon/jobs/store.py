@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import numpy as np
 import torch
 
-from recon.evaluate import execute
-from recon.evaluate.sources import source_digest
+from recon.jobs import execute
+from recon.jobs.sources import source_digest
 from torchpcct.files import LEFTOVER, abandoned, atomic_write, is_foreign, read_hdf5
 
 if TYPE_CHECKING:
@@ -225,7 +225,7 @@ class Pieces:
         """Let other processes compute pieces of calls that are independent, before this one reads
         them one by one.
 
-        Nothing without an executor (:mod:`recon.evaluate.execute`), or where nothing is kept.
+        Nothing without an executor (:mod:`recon.jobs.execute`), or where nothing is kept.
 
         Args:
             function: of a module; called as ``function(settings, pieces, *call)`` it computes
