@@ -1,5 +1,8 @@
-"""Execute notebooks and store them with their outputs: ``python notebooks/execute.py [--full]
-[notebook …]``.
+"""Execute notebooks and store them with their outputs: ``python notebooks/execute.py
+[--quick | --full] [notebook …]``.
+
+Without an option each is executed at the scale that it is stored at: that is what renews all of
+them after a change.
 
 The metadata keep the hash of the weights that MBIR ran with and the digest of the sources that made
 what is shown (:func:`sources_digest`): tests compare both with what there is now."""
@@ -90,8 +93,13 @@ def _bare(tree: ast.Module) -> ast.Module:
     return tree
 
 
-def execute(path: Path, quick: bool, timeout: int = 7200) -> float:
+def execute(path: Path, quick: bool | None = None, timeout: int = 7200) -> float:
     """Run one notebook in its own folder and write it back whole; returns the time in s.
+
+    Args:
+        path: of the notebook.
+        quick: what its switch ``QUICK`` is set to; None: it stays.
+        timeout: for a cell, s.
 
     Raises:
         ValueError: a full run of a notebook that has no switch ``QUICK``.
@@ -101,10 +109,10 @@ def execute(path: Path, quick: bool, timeout: int = 7200) -> float:
     notebook = nbformat.read(path, as_version=4)
     found = 0
     for cell in notebook.cells:
-        if cell.cell_type == "code":
+        if cell.cell_type == "code" and quick is not None:
             cell.source, count = PARAMETER.subn(f"QUICK = {quick}", cell.source)
             found += count
-    if not quick and not found:
+    if quick is False and not found:
         raise ValueError(
             f"{path} has no line QUICK = True in a code cell, so there is no full run of it"
         )
@@ -135,12 +143,20 @@ def main() -> None:
     parser.add_argument(
         "notebooks", nargs="*", type=Path, help="files (default: all beside this script)"
     )
-    parser.add_argument(
-        "--full", action="store_true", help="all views and more realisations: QUICK = False"
+    scale = parser.add_mutually_exclusive_group()
+    scale.add_argument(
+        "--quick", action="store_true", default=None, help="few views and draws: QUICK = True"
+    )
+    scale.add_argument(
+        "--full",
+        action="store_false",
+        dest="quick",
+        default=None,
+        help="all views and more draws: QUICK = False",
     )
     options = parser.parse_args()
     for path in options.notebooks or sorted(HERE.glob("*.ipynb")):
-        seconds = execute(path, not options.full)
+        seconds = execute(path, options.quick)
         sys.stderr.write(f"{path}: {seconds:.0f} s, {path.stat().st_size / 1e3:.0f} kB\n")
 
 

@@ -12,6 +12,7 @@ from recon.study.compare import claim, dose_chart
 from recon.study.report import aligned, render
 
 
+@pytest.mark.extended
 def test_report(tiny, tmp_path):
     study = tiny("compare")
     data = assert_report_is_whole(

@@ -60,6 +60,7 @@ def test_motion_spoils_and_its_knowledge_repairs(tiny):
     assert ("pwls", 0.2, False) not in m.compensated
 
 
+@pytest.mark.extended
 def test_report(tiny, tmp_path):
     study = tiny("motion")
     sections = (

@@ -133,6 +133,7 @@ def test_the_scanners(tiny):
     assert len(eid["blurred"]) == 1
 
 
+@pytest.mark.extended
 def test_report(tiny, tmp_path):
     """Every row of the list is there; a core that is lost early names its cause."""
     study = tiny("resolution")
