@@ -55,7 +55,7 @@ from torchpcct.checks.readings import reading_warnings
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.formats.scans import adapted, open_scan, own_options
 from torchpcct.formats.volume_slabs import CHUNK, SlabFile, check_slab_name
-from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
+from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.readings import MOST_DEAD
 from torchpcct.scan import Scan
@@ -159,7 +159,7 @@ class ScanSlices:
         self.unit, self.water = self.first.unit, self.first.linearisation.mu_ref
         start, _, self.count = info["slices"]
         g = self.first.geometry
-        self.geometry: Any = g.with_rows(-start, self.count) if isinstance(g, ConeBeam) else g
+        self.geometry: Any = g.with_rows(-start, self.count)
         lead = () if g.has_rows else (self.count,)
         self.counts = torch.empty((*lead, *self.geometry.shape), device="meta")
 
@@ -326,7 +326,7 @@ class _Fbp:
             sides,
             water,
         )
-        self.cone = isinstance(geometry, ConeBeam)
+        self.cone = geometry.has_rows
         self.plane = grid if self.cone else grid.slice
         self.weights = angular_weights(geometry, self.plane)
         self.wide: Any = self.complete(
@@ -460,7 +460,7 @@ def plan_slabs(
 
 def _check(geometry: Geometry, grid: VolumeGrid, method: str) -> None:
     choice("method", method, ("fbp", "pwls"))
-    if not isinstance(geometry, ParallelBeam | FanBeam | ConeBeam):
+    if not geometry.on_circle:
         raise ValueError(
             "slabs are of parallel, fan or cone beams on a circle: reconstruct a geometry view by "
             "view whole"

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
+from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, beam
 from torchpcct.validate import checked, whole
 from torchpcct.vector_geometry import VectorGeometry, check_motion
 
@@ -201,6 +201,7 @@ def footprint(
     """
     if isinstance(geometry, VectorGeometry):
         raise ValueError("a scan given view by view has no windows: use all of its detector")
+    geometry = beam(geometry)
     gz = grid.extent[0] / 2 if grid.ndim == 3 else 0.0
     cy, cx = grid.center[-2:]
     hy, hx = grid.extent[-2] / 2, grid.extent[-1] / 2
@@ -215,9 +216,8 @@ def footprint(
     along = x * np.cos(beta) + y * np.sin(beta)  # (views, 4), towards the source
     across = -x * np.sin(beta) + y * np.cos(beta)
     first_row, rows = 0, 1
-    if isinstance(geometry, ParallelBeam):
-        position, pitch = across, geometry.pitch
-    elif isinstance(geometry, FanBeam | ConeBeam):
+    position, pitch = across, geometry.column_pitch
+    if not isinstance(geometry, ParallelBeam):
         depth = geometry.sod - along
         if depth.min() <= 0:
             raise ValueError(
@@ -229,7 +229,6 @@ def footprint(
             position = geometry.sdd * np.arctan2(across, depth)
         else:
             position = geometry.sdd * across / depth
-        pitch = geometry.pitch if isinstance(geometry, FanBeam) else geometry.pitch[1]
         if isinstance(geometry, ConeBeam):
             reach = (
                 np.array([grid.center[0] - gz, grid.center[0] + gz])
@@ -244,8 +243,8 @@ def footprint(
                 * (reach[:, None, None] + (shift[:, :1] if grid.ndim == 3 else 0.0))
                 / distance
             )
-            row0 = (v.min() - geometry.row_positions[0]) / geometry.pitch[0] - 0.5
-            row1 = (v.max() - geometry.row_positions[0]) / geometry.pitch[0] + 0.5
+            row0 = (v.min() - geometry.row_positions[0]) / geometry.row_pitch - 0.5
+            row1 = (v.max() - geometry.row_positions[0]) / geometry.row_pitch + 0.5
             if row1 < 0.0 or row0 > geometry.rows - 1:
                 raise ValueError(
                     f"the grid (z = {reach[0]:g} … {reach[1]:g} mm) lies above or below all "
@@ -254,8 +253,6 @@ def footprint(
                 )
             first_row = int(np.clip(math.floor(row0), 0, geometry.rows - 1))
             rows = int(np.clip(math.ceil(row1), first_row, geometry.rows - 1)) - first_row + 1
-    else:
-        raise TypeError(f"unknown geometry {type(geometry).__name__}")
     index = (position - geometry.column_positions[0]) / pitch
     low, high = index.min(axis=1), index.max(axis=1)
     if low.min() < -0.5 - 1e-9 or high.max() > geometry.columns - 0.5 + 1e-9:

@@ -19,7 +19,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,11 +27,13 @@ from numpy.typing import NDArray
 from torchpcct.validate import checked, choice, number, per_axis, whole
 
 __all__ = [
+    "Beam",
     "ConeBeam",
     "FanBeam",
     "Geometry",
     "ParallelBeam",
     "VolumeGrid",
+    "beam",
     "full_turn",
     "view_step",
 ]
@@ -136,6 +138,80 @@ class Geometry:
         """Whether the detector has rows, so that one sinogram makes a volume and not a plane."""
         return len(self.shape) == 3
 
+    @property
+    def on_circle(self) -> bool:
+        """Whether one detector turns about the axis: parallel, fan and cone beams; not what is
+        given view by view."""
+        return True
+
+    @property
+    def parallel(self) -> bool:
+        """Whether the rays of a view are parallel."""
+        return False
+
+    @property
+    def column_pitch(self) -> float:
+        """Width of a cell, mm on the detector."""
+        raise NotImplementedError
+
+    @property
+    def row_pitch(self) -> float:
+        """Height of a cell, mm on the detector; inf without rows, whose slices have any height."""
+        return math.inf
+
+    @property
+    def column_offset(self) -> float:
+        """Position of the detector's centre along the columns, mm."""
+        raise NotImplementedError
+
+    @property
+    def row_offset(self) -> float:
+        """Position of the detector's centre along the rows, mm; 0 without rows."""
+        return 0.0
+
+    @property
+    def row_positions(self) -> Floats:
+        """Row centres along z on the detector, ``(rows,)`` mm; 0 without rows."""
+        return np.zeros(1)
+
+    @property
+    def magnification(self) -> float:
+        """Of the detector over the axis: ``sdd / sod``, 1 for parallel rays."""
+        return 1.0
+
+    @property
+    def cell(self) -> float:
+        """Width of a column as it is seen at the axis, mm."""
+        return self.column_pitch / self.magnification
+
+    @property
+    def cell_height(self) -> float:
+        """Height of a row as it is seen at the axis, mm; inf without rows."""
+        return self.row_pitch / self.magnification
+
+    def widened(self: G, before: int, behind: int) -> G:
+        """The same beam with so many more columns before the first and behind the last one
+        (fewer: negative), the others at their places."""
+        changed = self.with_column_offset(
+            self.column_offset + 0.5 * (behind - before) * self.column_pitch
+        )
+        return replace(changed, columns=self.columns + before + behind)  # type: ignore[type-var]
+
+    def interleaved(self: G) -> G:
+        """The same beam on twice as many columns of half the pitch, every second one at the place
+        of one of this beam."""
+        pitch, offset = self.column_pitch / 2.0, self.column_offset + self.column_pitch / 4.0
+        return replace(self, columns=2 * self.columns, pitch=pitch, offset=offset)  # type: ignore[type-var]
+
+    def with_column_offset(self: G, offset: float) -> G:
+        """The same beam with the detector's centre elsewhere along the columns, mm."""
+        return replace(self, offset=offset)  # type: ignore[type-var]
+
+    def with_rows(self: G, first: int, rows: int) -> G:
+        """The same beam on ``rows`` rows, the first of which is row ``first`` of this detector, at
+        their places; without rows a beam is that of every slice, and stays."""
+        return self
+
     def select(self: G, views: Any) -> G:
         """The same scanner with a subset (or reordering) of the views: an index array, mask or
         slice."""
@@ -187,9 +263,32 @@ class ParallelBeam(Geometry):
         set_(self, "offset", number("offset", self.offset, unit="mm"))
 
     @property
+    def parallel(self) -> bool:
+        return True
+
+    @property
+    def column_pitch(self) -> float:
+        return self.pitch
+
+    @property
+    def column_offset(self) -> float:
+        return self.offset
+
+    @property
     def column_positions(self) -> Floats:
         """Cell centres along ``e_t``, ``(columns,)`` mm."""
         return _axis(self.columns, self.pitch, self.offset)
+
+    @property
+    def ray_distances(self) -> Floats:
+        """Distance from the axis of the ray to every column centre, signed, ``(columns,)`` mm."""
+        return self.column_positions
+
+    @property
+    def fov_radius(self) -> float:
+        """Radius in mm of the disc about the axis that every view sees whole (outer cell edges)."""
+        u = self.column_positions
+        return max(float(min(-u[0], u[-1])) + self.pitch / 2.0, 0.0)
 
 
 class _Divergent(Geometry):
@@ -213,8 +312,9 @@ class _Divergent(Geometry):
             )
         choice("detector", self.detector, ("flat", "curved"))
 
-    def _validate_arc(self, pitch: float, offset: float) -> None:
+    def _validate_arc(self) -> None:
         if self.detector == "curved":
+            pitch, offset = self.column_pitch, self.column_offset
             half = (self.columns * pitch / 2 + abs(offset)) / self.sdd
             if half >= math.pi / 2:
                 raise ValueError(
@@ -225,14 +325,18 @@ class _Divergent(Geometry):
 
     @property
     def magnification(self) -> float:
-        """``sdd / sod``."""
         return self.sdd / self.sod
 
     @property
     def column_positions(self) -> Floats:
         """Cell centres along the detector (flat: along ``e_t``; curved: along the arc),
         ``(columns,)`` mm."""
-        raise NotImplementedError
+        return _axis(self.columns, self.column_pitch, self.column_offset)
+
+    @property
+    def ray_distances(self) -> Floats:
+        """Distance from the axis of the ray to every column centre, signed, ``(columns,)`` mm."""
+        return self.sod * np.sin(self.fan_angles)
 
     @property
     def fan_angles(self) -> Floats:
@@ -245,8 +349,11 @@ class _Divergent(Geometry):
         """Radius in mm of the disc about the isocentre that every view sees whole (outer cell
         edges)."""
         u = self.column_positions
-        pitch = self.pitch[1] if isinstance(self.pitch, tuple) else self.pitch
-        half_pitch = 0.5 * (u[-1] - u[0]) / (self.columns - 1) if self.columns > 1 else 0.5 * pitch
+        half_pitch = (
+            0.5 * (u[-1] - u[0]) / (self.columns - 1)
+            if self.columns > 1
+            else 0.5 * self.column_pitch
+        )
         edge = min(-(u[0] - half_pitch), u[-1] + half_pitch)
         gamma = edge / self.sdd if self.detector == "curved" else math.atan(edge / self.sdd)
         return self.sod * math.sin(max(gamma, 0.0))
@@ -283,11 +390,15 @@ class FanBeam(_Divergent):
         self._validate_divergent()
         object.__setattr__(self, "pitch", number("pitch", self.pitch, positive=True, unit="mm"))
         object.__setattr__(self, "offset", number("offset", self.offset, unit="mm"))
-        self._validate_arc(self.pitch, self.offset)
+        self._validate_arc()
 
     @property
-    def column_positions(self) -> Floats:
-        return _axis(self.columns, self.pitch, self.offset)
+    def column_pitch(self) -> float:
+        return self.pitch
+
+    @property
+    def column_offset(self) -> float:
+        return self.offset
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -326,26 +437,46 @@ class ConeBeam(_Divergent):
             self, "pitch", per_axis("pitch", self.pitch, 2, positive=True, unit="mm")
         )
         object.__setattr__(self, "offset", per_axis("offset", self.offset, 2, unit="mm"))
-        self._validate_arc(self.pitch[1], self.offset[1])
+        self._validate_arc()
 
     @property
     def shape(self) -> tuple[int, ...]:
         return (self.views, self.rows, self.columns)
 
     @property
-    def column_positions(self) -> Floats:
-        return _axis(self.columns, self.pitch[1], self.offset[1])
+    def column_pitch(self) -> float:
+        return float(self.pitch[1])
+
+    @property
+    def row_pitch(self) -> float:
+        return float(self.pitch[0])
+
+    @property
+    def column_offset(self) -> float:
+        return float(self.offset[1])
+
+    @property
+    def row_offset(self) -> float:
+        return float(self.offset[0])
 
     @property
     def row_positions(self) -> Floats:
-        """Row centres along z on the detector, ``(rows,)`` mm."""
-        return _axis(self.rows, self.pitch[0], self.offset[0])
+        return _axis(self.rows, self.row_pitch, self.row_offset)
+
+    def interleaved(self) -> ConeBeam:
+        return replace(
+            self,
+            columns=2 * self.columns,
+            pitch=(self.row_pitch, self.column_pitch / 2.0),
+            offset=(self.row_offset, self.column_offset + self.column_pitch / 4.0),
+        )
+
+    def with_column_offset(self, offset: float) -> ConeBeam:
+        return replace(self, offset=(self.row_offset, offset))
 
     def with_rows(self, first: int, rows: int) -> ConeBeam:
-        """The same beam on ``rows`` rows, the first of which is row ``first`` of this detector,
-        at their places."""
-        shift = (first + 0.5 * (rows - self.rows)) * self.pitch[0]
-        return replace(self, rows=rows, offset=(self.offset[0] + shift, self.offset[1]))
+        shift = (first + 0.5 * (rows - self.rows)) * self.row_pitch
+        return replace(self, rows=rows, offset=(self.row_offset + shift, self.column_offset))
 
     @property
     def central_fan(self) -> FanBeam:
@@ -355,10 +486,27 @@ class ConeBeam(_Divergent):
             self.sod,
             self.sdd,
             self.columns,
-            self.pitch[1],
-            self.offset[1],
+            self.column_pitch,
+            self.column_offset,
             self.detector,
         )
+
+
+Beam: TypeAlias = ParallelBeam | FanBeam | ConeBeam
+"""A scan on a circle."""
+
+
+def beam(geometry: Geometry) -> Beam:
+    """The geometry, where it must be one on a circle.
+
+    Raises:
+        TypeError: another one.
+    """
+    if not isinstance(geometry, ParallelBeam | FanBeam | ConeBeam):
+        raise TypeError(
+            f"geometry must be ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}"
+        )
+    return geometry
 
 
 @dataclass(frozen=True)

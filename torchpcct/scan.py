@@ -418,7 +418,7 @@ class Scan:
     def _first_index(self) -> Any:
         """Global index of the first reading of every detector row held in ``counts``."""
         g, w = self.geometry, self.window or DetectorWindow.full(self.geometry)
-        if not isinstance(g, ConeBeam):  # all of the detector, cells in the order in memory
+        if not (g.on_circle and g.has_rows):  # all of the detector, cells in the order in memory
             return np.arange(math.prod(self.counts.shape[:-1])) * g.columns
         line = np.arange(g.views)[:, None] * g.rows + w.first_row + np.arange(w.rows)
         index = line * g.columns + w.first_column[:, None]

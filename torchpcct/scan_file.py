@@ -169,11 +169,7 @@ def slice_axis(geometry: Geometry, shape: tuple[int, ...], window: Any = None) -
     Raises:
         NoSlicesError: there is none.
     """
-    if (
-        len(shape) != 3
-        or window is not None
-        or (geometry.has_rows and not isinstance(geometry, ConeBeam))
-    ):
+    if len(shape) != 3 or window is not None or (geometry.has_rows and not geometry.on_circle):
         kind = "part of a detector (a region)" if window is not None else type(geometry).__name__
         raise NoSlicesError(
             "slices= picks slices of parallel and fan beams or rows of a cone beam, this is one "
@@ -191,8 +187,7 @@ def sliced(geometry: Any, slices: slice, count: int) -> tuple[Any, list[int]]:
         ends = ":".join("" if end is None else str(end) for end in (slices.start, slices.stop))
         what = "rows" if geometry.has_rows else "slices"
         raise ValueError(f"slices= must lie within the {count} {what} of the scan, got {ends}")
-    cone = isinstance(geometry, ConeBeam)
-    return geometry.with_rows(first, stop - first) if cone else geometry, [first, stop, count]
+    return geometry.with_rows(first, stop - first), [first, stop, count]
 
 
 def write_geometry(group: Any, geometry: Geometry) -> None:
@@ -207,9 +202,9 @@ def write_geometry(group: Any, geometry: Geometry) -> None:
         return
     group["angles_rad"] = g.angles
     group.attrs.update(pitch_mm=g.pitch, offset_mm=g.offset)
-    if not isinstance(g, ParallelBeam):
+    if not g.parallel:
         group.attrs.update(sod_mm=g.sod, sdd_mm=g.sdd, detector=g.detector)
-    if isinstance(g, ConeBeam):
+    if g.has_rows:
         group.attrs["rows"] = g.rows
 
 

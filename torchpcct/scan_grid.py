@@ -11,7 +11,7 @@ from scipy.optimize import linprog
 
 from torchpcct.angles import is_offset, view_steps
 from torchpcct.detector_window import NOISE_MARGIN_COLUMNS, DetectorWindow, footprint
-from torchpcct.geometry import ConeBeam, ParallelBeam, VolumeGrid
+from torchpcct.geometry import Beam, ConeBeam, Geometry, VolumeGrid
 from torchpcct.validate import number, numbers
 from torchpcct.vector_geometry import VectorGeometry
 
@@ -51,7 +51,7 @@ def grid_of(scan: Any, voxel: Any = None, extent: Any = None, center: Any = None
         height = size[0] or high - low - float(np.median(np.ptp(heights, axis=1))) * radius / orbit
         middle = 0.5 * (low + high) if center[0] is None else center[0]
     else:
-        height = size[0] or g.rows * g.pitch[0] / g.magnification * (1.0 - radius / g.sod)
+        height = size[0] or g.rows * g.cell_height * (1.0 - radius / g.sod)
         middle = center[0] or 0.0
     return VolumeGrid(
         (max(1, math.floor(height / voxel + _SLACK)), *plane), voxel, (middle, *center[1:])
@@ -91,44 +91,25 @@ def _of_axes(scan: Any, extent: Any, center: Any) -> tuple[list[float] | None, l
     ) + center
 
 
-def _field_of_view(g: Any) -> tuple[float, float]:
+def _field_of_view(g: Beam | VectorGeometry) -> tuple[float, float]:
     """Size of a cell at the axis, and radius of what is seen, mm."""
     if isinstance(g, VectorGeometry):
-        return _cell(g), float(g.border_rays()[0].max())
-    if isinstance(g, ParallelBeam):
-        u = g.column_positions
-        return _cell(g), float(max(-u[0], u[-1]))
-    radius = g.sod * math.sin(float(np.abs(g.fan_angles).max()))
-    if is_offset(g) and view_steps(g.angles)[2] < 2.0 * math.pi:
-        radius = g.fov_radius  # of a short scan the lines that the short side measures, too
-    return _cell(g), radius
+        return g.cell, float(g.border_rays()[0].max())
+    if not g.parallel and is_offset(g) and view_steps(g.angles)[2] < 2.0 * math.pi:
+        return g.cell, g.fov_radius  # of a short scan the lines that the short side measures, too
+    return g.cell, float(np.abs(g.ray_distances).max())
 
 
-def _cell(g: Any) -> float:
-    if isinstance(g, VectorGeometry):
-        return g.cell
-    if isinstance(g, ParallelBeam):
-        return float(g.pitch)
-    pitch = g.pitch[1] if isinstance(g, ConeBeam) else g.pitch
-    return float(pitch / g.magnification)
-
-
-def cells_at_axis(geometry: Any) -> tuple[float, float, float]:
+def cells_at_axis(geometry: Geometry) -> tuple[float, float, float]:
     """Size of a detector cell as it is seen at the axis, along z, y and x in mm; along z inf
     without rows.
 
     Of a geometry view by view the median over its views.
     """
-    cell = _cell(geometry)
-    if isinstance(geometry, ConeBeam):
-        return geometry.pitch[0] / geometry.magnification, cell, cell
-    if isinstance(geometry, VectorGeometry) and geometry.rows is not None:
-        columns, rows = (np.linalg.norm(geometry.poses[:, k], axis=1) for k in (2, 3))
-        return cell * float(np.median(rows / columns)), cell, cell
-    return math.inf, cell, cell
+    return geometry.cell_height, geometry.cell, geometry.cell
 
 
-def finite_cells(geometry: Any) -> list[float]:
+def finite_cells(geometry: Geometry) -> list[float]:
     """:func:`cells_at_axis` without z, where there are no rows."""
     return [cell for cell in cells_at_axis(geometry) if math.isfinite(cell)]
 
@@ -141,10 +122,10 @@ def _of_region(scan: Any, voxel: float | None, extent: Any, center: Any) -> Volu
     about it."""
     region = scan.region
     if region is None:
-        voxel = voxel or _cell(scan.geometry)
+        voxel = voxel or scan.geometry.cell
         region = _seen_by(scan.geometry, scan.window, voxel)
     elif region.voxels == 1:
-        voxel = voxel or _cell(scan.geometry)
+        voxel = voxel or scan.geometry.cell
     if voxel is None and extent is None and center is None:
         return region
     spacing = voxel or region.spacing

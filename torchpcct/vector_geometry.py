@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
+from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, beam
 from torchpcct.validate import checked, number, whole
 
 __all__ = ["VectorGeometry", "check_motion", "helical_motion"]
@@ -124,40 +124,25 @@ class VectorGeometry(Geometry):
                 shape.
             TypeError: another geometry.
         """
-        if not isinstance(geometry, ParallelBeam | FanBeam | ConeBeam):
-            raise TypeError(
-                f"geometry must be ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}"
-            )
-        rows, parallel = (
-            geometry.rows if isinstance(geometry, ConeBeam) else None,
-            isinstance(geometry, ParallelBeam),
-        )
+        geometry = beam(geometry)
         radial = np.stack([np.cos(geometry.angles), np.sin(geometry.angles)], axis=1)
         tangent = np.stack([-radial[:, 1], radial[:, 0]], axis=1)
+        u = geometry.column_pitch * tangent
         if isinstance(geometry, ParallelBeam):
-            parts = [-radial, geometry.offset * tangent, geometry.pitch * tangent]
+            first, centre = -radial, geometry.column_offset * tangent
         else:
             if geometry.detector == "curved":
                 raise ValueError(
                     "vectors describe flat detectors only, this one is curved: use detector='flat'"
                 )
-            source, foot = geometry.sod * radial, (geometry.sod - geometry.sdd) * radial
-            if isinstance(geometry, FanBeam):
-                parts = [source, foot + geometry.offset * tangent, geometry.pitch * tangent]
-            else:
-                zero = np.zeros((geometry.views, 1))
-                parts = [
-                    source,
-                    zero,
-                    foot + geometry.offset[1] * tangent,
-                    zero + geometry.offset[0],
-                    geometry.pitch[1] * tangent,
-                    zero,
-                    zero,
-                    zero,
-                    zero + geometry.pitch[0],
-                ]
-        made = cls(np.concatenate(parts, axis=1), geometry.columns, rows, parallel)
+            first = geometry.sod * radial
+            centre = (geometry.sod - geometry.sdd) * radial + geometry.column_offset * tangent
+        parts, rows = [first, centre, u], None
+        if geometry.has_rows:
+            zero, rows = np.zeros((geometry.views, 1)), geometry.shape[1]
+            up = [zero, zero, zero + geometry.row_pitch]
+            parts = [first, zero, centre, zero + geometry.row_offset, u, zero, *up]
+        made = cls(np.concatenate(parts, axis=1), geometry.columns, rows, geometry.parallel)
         return made if motion is None else made.moved(motion)
 
     def border_rays(self) -> tuple[Floats, Floats, Floats]:
@@ -196,8 +181,62 @@ class VectorGeometry(Geometry):
         return np.linalg.norm(nearest[..., :2], axis=-1), nearest[..., 2], ray[..., 2]
 
     @property
+    def on_circle(self) -> bool:
+        return False
+
+    @property
+    def column_pitch(self) -> float:
+        """Length of u, mm: the median over the views."""
+        return float(np.median(np.linalg.norm(self.poses[:, 2], axis=1)))
+
+    @property
+    def row_pitch(self) -> float:
+        """Length of v, mm: the median over the views; inf without rows."""
+        if self.rows is None:
+            return math.inf
+        return float(np.median(np.linalg.norm(self.poses[:, 3], axis=1)))
+
+    @property
+    def column_offset(self) -> float:
+        """Along u from where the ray through the axis (at the source's height) meets the detector
+        to its centre, mm: the median over the views."""
+        return float(np.median(self._offsets(2)))
+
+    @property
+    def row_offset(self) -> float:
+        """The same along v."""
+        return 0.0 if self.rows is None else float(np.median(self._offsets(3)))
+
+    def _offsets(self, axis: int) -> Floats:
+        first, centre, u, v = self.poses.transpose(1, 0, 2)
+        source = np.zeros_like(first) if self.parallel else first
+        ray = first if self.parallel else first * [-1.0, -1.0, 0.0]
+        normal = np.cross(u, v)
+        way = ((centre - source) * normal).sum(1) / (ray * normal).sum(1)
+        along = self.poses[:, axis]
+        beside = centre - source - way[:, None] * ray
+        return np.asarray((beside * along).sum(1) / np.linalg.norm(along, axis=1))
+
+    @property
+    def magnification(self) -> float:
+        """Of the detector over the axis: the median over the views."""
+        return self.column_pitch / self.cell
+
+    @property
     def cell(self) -> float:
         """Width of a column where the rays cross the axis, mm: the median over the views."""
+        return float(np.median(self._cells))
+
+    @property
+    def cell_height(self) -> float:
+        """Height of a row where the rays cross the axis, mm, in the ratio of v to u."""
+        if self.rows is None:
+            return math.inf
+        columns, rows = (np.linalg.norm(self.poses[:, k], axis=1) for k in (2, 3))
+        return self.cell * float(np.median(rows / columns))
+
+    @property
+    def _cells(self) -> Floats:
         source, centre, u, _ = self.poses.transpose(1, 0, 2)
         width = np.linalg.norm(u, axis=1)
         if not self.parallel:
@@ -205,7 +244,34 @@ class VectorGeometry(Geometry):
             least = 1e-9 * float(np.abs(self.vectors).max())
             depth = ((source - centre)[:, :2] * source[:, :2]).sum(1) / np.maximum(orbit, least)
             width = width * orbit / np.maximum(np.abs(depth), least)
-        return float(np.median(width))
+        return np.asarray(width)
+
+    def widened(self, before: int, behind: int) -> VectorGeometry:
+        """The same detectors with so many more columns before the first and behind the last one
+        (fewer: negative), the others at their places."""
+        poses = self.poses
+        wide = self._with(1, poses[:, 1] + 0.5 * (behind - before) * poses[:, 2])
+        return replace(wide, columns=self.columns + before + behind)
+
+    def interleaved(self) -> VectorGeometry:
+        poses = self.poses
+        finer = self._with(1, poses[:, 1] + poses[:, 2] / 4.0, 2, poses[:, 2] / 2.0)
+        return replace(finer, columns=2 * self.columns)
+
+    def with_column_offset(self, offset: float) -> VectorGeometry:
+        """The detectors displaced along u, so that their offset is this one."""
+        poses = self.poses
+        along = poses[:, 2] / np.linalg.norm(poses[:, 2], axis=1, keepdims=True)
+        return self._with(1, poses[:, 1] + (offset - self.column_offset) * along)
+
+    def with_rows(self, first: int, rows: int) -> VectorGeometry:
+        """The same detectors on ``rows`` rows, the first of which is row ``first``, at their
+        places."""
+        if self.rows is None:
+            return self
+        poses = self.poses
+        up = (first + 0.5 * (rows - self.rows)) * poses[:, 3]
+        return replace(self._with(1, poses[:, 1] + up), rows=rows)
 
     def select(self, views: Any) -> VectorGeometry:
         """The same scan with a subset (or reordering) of the views: an index array, mask or

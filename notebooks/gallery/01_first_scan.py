@@ -12,7 +12,7 @@ from torchpcct import VolumeGrid, acquire
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene
 
-# a vessel with a plaque in 24 cm of fat: shapes with formulas
+# a vessel with a plaque in 24 cm of fat, as analytic bodies
 scene, plaque = plaque_scene(vessel_length=6.0)
 inset = VolumeGrid((33, 39, 39), 0.2, plaque.position[::-1])  # (z, y, x) voxels, mm, centre in mm
 scan = acquire(

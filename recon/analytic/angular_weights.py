@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.angles import OPEN_GAP_STEPS, SAME_VIEW, is_offset, view_steps
-from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
+from torchpcct.geometry import Geometry, ParallelBeam, VolumeGrid, beam
 from torchpcct.validate import checked
 
 __all__ = ["angular_weights", "check_gaps", "offset_share", "parker_share"]
@@ -168,6 +168,7 @@ def angular_weights(geometry: Geometry, grid: VolumeGrid | None = None) -> Float
             lack inside of the arc.
         TypeError: not a geometry.
     """
+    geometry = beam(geometry)
     if isinstance(geometry, ParallelBeam):
         check_gaps(geometry.angles, math.pi)
         if is_offset(geometry):
@@ -182,10 +183,6 @@ def angular_weights(geometry: Geometry, grid: VolumeGrid | None = None) -> Float
                 'reconstruct by "pwls" or "mbir"'
             )
         return steps[:, None]
-    if not isinstance(geometry, FanBeam | ConeBeam):
-        raise TypeError(
-            f"geometry must be a ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}"
-        )
     check_gaps(geometry.angles)
     steps, start, span = view_steps(geometry.angles)
     gamma = geometry.fan_angles

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
+from torchpcct.geometry import Geometry, ParallelBeam, VolumeGrid, beam
 from torchpcct.projector.operator import apply_linear
 from torchpcct.threads import run
 from torchpcct.validate import checked
@@ -66,7 +66,7 @@ def check_data(name: str, data: Any, shape: tuple[int, ...]) -> None:
 
 @checked
 def data_shape(geometry: Geometry, window: DetectorWindow) -> tuple[int, ...]:
-    if isinstance(geometry, ConeBeam):
+    if geometry.has_rows:
         return (window.views, window.rows, window.columns)
     return (window.views, window.columns)
 
@@ -79,17 +79,12 @@ class BackprojectionPlan:
         self, geometry: Geometry, grid: VolumeGrid, window: DetectorWindow, motion: Any = None
     ) -> None:
         self.grid, self.window = grid, window
-        self.cone = isinstance(geometry, ConeBeam)
+        geometry = beam(geometry)
+        self.cone, pitch = geometry.has_rows, geometry.column_pitch
         if isinstance(geometry, ParallelBeam):
-            self.kind, self.sod, self.sdd, pitch = _KIND["parallel"], 0.0, 0.0, geometry.pitch
-        elif isinstance(geometry, FanBeam | ConeBeam):
-            self.kind, self.sod, self.sdd = _KIND[geometry.detector], geometry.sod, geometry.sdd
-            pitch = geometry.pitch if isinstance(geometry, FanBeam) else geometry.pitch[1]
+            self.kind, self.sod, self.sdd = _KIND["parallel"], 0.0, 0.0
         else:
-            raise TypeError(
-                "geometry must be a ParallelBeam, FanBeam or ConeBeam, got "
-                f"{type(geometry).__name__}"
-            )
+            self.kind, self.sod, self.sdd = _KIND[geometry.detector], geometry.sod, geometry.sdd
         axes = 3 if self.cone else 2
         if grid.ndim != axes:
             raise ValueError(
@@ -109,9 +104,9 @@ class BackprojectionPlan:
         first = geometry.column_positions[0]
         self.starts = -first / pitch - window.first_column.astype(np.float64)
         self.row_scale = self.row_start = 0.0
-        if isinstance(geometry, ConeBeam):
-            self.row_scale = 1.0 / geometry.pitch[0]
-            self.row_start = -geometry.row_positions[0] / geometry.pitch[0] - window.first_row
+        if self.cone:
+            self.row_scale = 1.0 / geometry.row_pitch
+            self.row_start = -geometry.row_positions[0] / geometry.row_pitch - window.first_row
         self.mask = self._outside(geometry)
         self._check_window(geometry)
 
@@ -120,14 +115,9 @@ class BackprojectionPlan:
 
         A grid that moves loses the voxels that its longest displacement could take out of the field
         of view."""
-        if isinstance(geometry, ParallelBeam):
-            u = geometry.column_positions
-            radius = max(min(-u[0], u[-1]) + geometry.pitch / 2.0, 0.0)
-        else:
-            radius = geometry.fov_radius
-        self.radius = float(radius)
+        self.radius = float(geometry.fov_radius)
         y, x = self.grid.axes[-2:]
-        outside = np.hypot(y[:, None], x[None, :]) + self.travel > radius * (1.0 + 1e-9)
+        outside = np.hypot(y[:, None], x[None, :]) + self.travel > self.radius * (1.0 + 1e-9)
         if not outside.any():
             return None
         half_y, half_x = self.grid.extent[-2] / 2.0, self.grid.extent[-1] / 2.0
@@ -136,7 +126,7 @@ class BackprojectionPlan:
             raise ValueError(
                 f"the grid (centre x {cx:g}, y {cy:g} mm, {2 * half_x:g} × {2 * half_y:g} mm) "
                 "leaves the field of view "
-                f"of radius {radius:.2f} mm: move or shrink it"
+                f"of radius {self.radius:.2f} mm: move or shrink it"
             )
         return outside
 
@@ -175,7 +165,7 @@ class BackprojectionPlan:
                 f"the window misses columns that the grid needs in view {int(np.argmax(missing))}: "
                 "use torchpcct.detector_window.footprint(geometry, grid, margin=1, motion=motion)"
             )
-        if isinstance(geometry, ConeBeam):
+        if self.cone:
             z = self.grid.axes[0][[0, -1]] + np.array(
                 [self.shifts[:, 2].min(), self.shifts[:, 2].max()]
             )

@@ -15,7 +15,7 @@ from recon.analytic.detector_edges import cut_off, reach
 from torchpcct.angles import SAME_VIEW, is_offset
 from torchpcct.checks.defects import BRIGHT
 from torchpcct.detector_window import footprint
-from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
+from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid, view_step
 from torchpcct.scan import Scan
 from torchpcct.validate import checked
 from torchpcct.vector_geometry import VectorGeometry
@@ -70,7 +70,7 @@ def refuse_helix(geometry: Geometry, motion: Any) -> None:
     if motion is None or not isinstance(geometry, ConeBeam) or geometry.views < 3:
         return
     z = np.asarray(motion, dtype=np.float64).reshape(-1, 3)[:, 0]
-    height = geometry.rows * geometry.pitch[0] / geometry.magnification
+    height = geometry.rows * geometry.cell_height
     if z.size != geometry.views or np.ptp(z) <= _TRAVEL * height:
         return
     if np.corrcoef(z, geometry.angles)[0, 1] ** 2 > _STEADY:
@@ -103,7 +103,7 @@ def check_rows(geometry: Geometry, grid: VolumeGrid, motion: Any = None) -> list
     shift = (
         np.zeros((1, 3)) if motion is None else np.asarray(motion, dtype=np.float64).reshape(-1, 3)
     )
-    half = geometry.pitch[0] / 2
+    half = geometry.row_pitch / 2
     bottom, top = geometry.row_positions[0] - half, geometry.row_positions[-1] + half
     # The grid's nearest and farthest voxels from the source over the turn: their rows are the
     # highest and the lowest.
@@ -155,11 +155,7 @@ def view_notes(geometry: Geometry) -> list[str]:
         geometry: of the scan, views in the order in which they were taken.
     """
     first, last = float(geometry.angles[0]), float(geometry.angles[-1])
-    turn = (
-        math.pi
-        if isinstance(geometry, ParallelBeam) and abs(last - first) < 1.5 * math.pi
-        else 2.0 * math.pi
-    )
+    turn = math.pi if geometry.parallel and abs(last - first) < 1.5 * math.pi else 2.0 * math.pi
     beyond = abs(abs(last - first) - turn)
     if geometry.views < 3 or beyond > SAME_VIEW * turn / geometry.views:
         return []
@@ -182,14 +178,9 @@ def sampling_warnings(geometry: Geometry) -> list[str]:
     Returns:
         Warnings; empty if the views suffice.
     """
-    if isinstance(geometry, ParallelBeam):
-        cell, radius = geometry.pitch, float(np.abs(geometry.column_positions).max())
-    else:
-        g: Any = geometry
-        cell, radius = (
-            (g.pitch[1] if isinstance(g, ConeBeam) else g.pitch) / g.magnification,
-            g.fov_radius,
-        )
+    cell, radius = geometry.cell, geometry.fov_radius
+    if geometry.parallel:
+        radius = float(np.abs(geometry.column_positions).max())
     apart = view_step(geometry.angles) * radius
     if apart <= STREAK_CELLS * cell:
         return []

@@ -10,7 +10,6 @@ of a cylinder that fits its last readings in value and slope (Hsieh et al., Med.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.angles import is_offset
-from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid
+from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.validate import checked
 
@@ -56,9 +55,7 @@ class Rows(NamedTuple):
 @checked
 def reach(geometry: Any) -> Floats:
     """Distance from the axis of the ray to every column centre, signed, ``(columns,)`` mm."""
-    if isinstance(geometry, ParallelBeam):
-        return np.asarray(geometry.column_positions)
-    return np.asarray(geometry.sod * np.sin(geometry.fan_angles))
+    return np.asarray(geometry.ray_distances)
 
 
 @checked
@@ -69,7 +66,7 @@ def cut_off(lines: Tensor, geometry: Any, weights: Floats) -> tuple[bool, bool]:
     """
     means = lines.detach()
     return ends_cut_off(
-        *row_ends(means.mean(-2) if isinstance(geometry, ConeBeam) else means), geometry, weights
+        *row_ends(means.mean(-2) if geometry.has_rows else means), geometry, weights
     )
 
 
@@ -122,23 +119,13 @@ def _rises(end: Tensor, limit: float) -> bool:
     return float((smooth > limit + margin).double().mean()) > _CUT_VIEWS
 
 
-def _wider(geometry: G, before: int, behind: int) -> G:
-    g: Any = geometry
-    cone = isinstance(g, ConeBeam)
-    pitch = g.pitch[1] if cone else g.pitch
-    shift = 0.5 * (behind - before) * pitch
-    offset = (g.offset[0], g.offset[1] + shift) if cone else g.offset + shift
-    changes: dict[str, Any] = {"columns": g.columns + before + behind, "offset": offset}
-    return replace(geometry, **changes)  # type: ignore[type-var]
-
-
 def _room(geometry: Any) -> tuple[int, int]:
     """Columns that fit before the first and behind the last one, as many as the detector has at
     most."""
     u, n = geometry.column_positions, geometry.columns
-    if isinstance(geometry, ParallelBeam):
+    if geometry.parallel:
         return n, n
-    pitch = geometry.pitch[1] if isinstance(geometry, ConeBeam) else geometry.pitch
+    pitch = geometry.column_pitch
     far = geometry.sdd * (_WIDEST_RAD if geometry.detector == "curved" else math.tan(_WIDEST_RAD))
     return tuple(int(min(n, max(0.0, (far - abs(end)) / pitch - 1))) for end in (u[0], u[-1]))  # type: ignore[return-value]
 
@@ -157,12 +144,12 @@ def mirrored(rows: Rows, grid: VolumeGrid, travel: float = 0.0) -> Rows:
     half_cell = 0.5 * (t[-1] - t[0]) / max(t.size - 1, 1)
     if grid.in_plane_radius + travel <= min(-t[0], t[-1]) + half_cell:
         return rows
-    pitch = g.pitch[1] if isinstance(g, ConeBeam) else g.pitch
+    pitch = g.column_pitch
     missing = round(abs(g.column_positions[0] + g.column_positions[-1]) / pitch)
     before, behind = (missing, 0) if t[-1] > -t[0] else (0, missing)
     lines = torch.nn.functional.pad(rows.lines, (before, behind))
     weights = np.pad(rows.weights, ((0, 0), (before, behind)))
-    return Rows(lines, _wider(g, before, behind), weights)
+    return Rows(lines, g.widened(before, behind), weights)
 
 
 @checked
@@ -178,10 +165,9 @@ def continued(rows: Rows, sides: tuple[bool, bool], outside: float) -> Rows:
     room = [space if side else 0 for space, side in zip(_room(g), sides, strict=True)]
     if outside <= 0 or not any(room) or g.columns < _FEWEST_COLUMNS:
         return rows
-    wide = _wider(g, *room)
+    wide = g.widened(*room)
     t = reach(wide)
-    cone = isinstance(g, ConeBeam)
-    heights = g.row_positions if cone else np.zeros(1)
+    cone, heights = g.has_rows, g.row_positions
     fit = max(_FEWEST_COLUMNS, min(32, g.columns // 20))
     parts = [rows.lines]
     for side, space in enumerate(room):

@@ -9,7 +9,6 @@ import warnings
 import weakref
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -25,7 +24,7 @@ from recon.analytic.detector_edges import Rows, continued, cut_off, mirrored
 from recon.analytic.filter_plan import FilterPlan, kernel_names
 from torchpcct.angles import view_steps
 from torchpcct.detector_window import DetectorWindow, footprint
-from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, view_step
+from torchpcct.geometry import Geometry, VolumeGrid, view_step
 from torchpcct.projector.operator import apply_linear
 from torchpcct.readings import bridge
 from torchpcct.validate import checked, number, reals
@@ -103,7 +102,7 @@ def filter_sinogram(
         held,
         whole if window is None else window,
     )
-    flat = not isinstance(geometry, ConeBeam)
+    flat = not geometry.has_rows
     given = (sinogram.unsqueeze(-2) if flat else sinogram).cpu()  # the kernels are CPU code
     out = apply_linear(given, plan.forward, plan.transpose).to(sinogram.device)
     out = out.squeeze(-2) if flat else out
@@ -144,23 +143,13 @@ def interleave(sinogram: Tensor, geometry: G) -> tuple[Tensor, G]:
     _check_opposites(geometry)
     # the mean of a reading and a zero is half the reading
     spread = torch.stack([2.0 * sinogram, torch.zeros_like(sinogram)], dim=-1).flatten(-2)
-    if isinstance(geometry, ConeBeam):
-        row, column = geometry.pitch
-        pitch: Any = (row, column / 2.0)
-        offset: Any = (geometry.offset[0], geometry.offset[1] + column / 4.0)
-    else:
-        g: Any = geometry
-        pitch, offset = g.pitch / 2.0, g.offset + g.pitch / 4.0
-    changes: dict[str, Any] = {"columns": 2 * geometry.columns, "pitch": pitch, "offset": offset}
-    return spread, replace(geometry, **changes)  # type: ignore[type-var]
+    return spread, geometry.interleaved()
 
 
 def _check_opposites(geometry: Any) -> None:
     """Whether the opposite rays that :func:`interleave` relies on were measured, and fall
     between two columns."""
-    pitch, offset = geometry.pitch, geometry.offset
-    if isinstance(geometry, ConeBeam):
-        pitch, offset = pitch[1], offset[1]
+    pitch, offset = geometry.column_pitch, geometry.column_offset
     quarters = (geometry.column_positions[0] / pitch) % 0.5
     if abs(quarters - 0.25) > 0.1:
         raise ValueError(
@@ -174,11 +163,8 @@ def _check_opposites(geometry: Any) -> None:
             "interleave needs the opposite of every ray, the views cover "
             f"{math.degrees(span):.1f}° of 360°"
         )
-    parallel = isinstance(geometry, ParallelBeam)
-    radius = (
-        pitch / (1.0 if parallel else geometry.magnification) / (2.0 * view_step(geometry.angles))
-    )
-    field = float(np.abs(geometry.column_positions).max()) if parallel else geometry.fov_radius
+    radius = geometry.cell / (2.0 * view_step(geometry.angles))
+    field = geometry.fov_radius
     if radius < field / 4.0:
         _LOG.warning(
             "interleave: with %d views aliasing cancels only within %.1f mm of the axis: use more "
@@ -398,7 +384,7 @@ def _without_dead(sinogram: Tensor, geometry: Geometry) -> Tensor:
         UserWarning,
         stacklevel=4,
     )
-    return bridge(sinogram, dead, isinstance(geometry, ConeBeam))
+    return bridge(sinogram, dead, geometry.has_rows)
 
 
 def _completed(rows: Rows, grid: VolumeGrid, motion: Any, outside: float | None) -> Rows:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from recon.analytic.ramp import fast_length, ramp_kernel
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
+from torchpcct.geometry import Geometry, ParallelBeam, beam
 from torchpcct.threads import run
 from torchpcct.validate import shaped
 
@@ -58,7 +58,7 @@ class FilterPlan:
     cosine: NDArray[np.float64] = field(init=False)
 
     def __post_init__(self) -> None:
-        g, a, b = self.geometry, self.window_in, self.window_out
+        g, a, b = beam(self.geometry), self.window_in, self.window_out
         for name, w in (("window_in", a), ("window_out", b)):
             w.check(g, name)
         shaped(
@@ -74,24 +74,17 @@ class FilterPlan:
                 "returns"
             )
         if isinstance(g, ParallelBeam):
-            pitch, curved = g.pitch, False
+            pitch, curved = g.column_pitch, False
             cosine = np.ones((1, g.columns))
-        elif isinstance(g, FanBeam | ConeBeam):
-            column_pitch = g.pitch if isinstance(g, FanBeam) else g.pitch[1]
+        else:
             curved = g.detector == "curved"
-            pitch = column_pitch / g.sdd if curved else column_pitch * g.sod / g.sdd
-            u, v = g.column_positions, np.zeros(1)
-            if isinstance(g, ConeBeam):
-                v = g.row_positions[b.first_row : b.first_row + b.rows]
+            pitch = g.column_pitch / g.sdd if curved else g.column_pitch * g.sod / g.sdd
+            u, v = g.column_positions, g.row_positions[b.first_row : b.first_row + b.rows]
             # Kak & Slaney eq. 3.97: R′ = R · D · cos γ; one D goes into the distance weight D²/L²
             if curved:
                 cosine = np.cos(u / g.sdd) * (g.sdd / np.hypot(g.sdd, v))[:, None] / g.sod
             else:
                 cosine = g.sdd / np.sqrt(g.sdd**2 + u**2 + v[:, None] ** 2)
-        else:
-            raise TypeError(
-                f"geometry must be a ParallelBeam, FanBeam or ConeBeam, got {type(g).__name__}"
-            )
         samples = np.stack(
             [ramp_kernel(g.columns, pitch, k, equiangular=curved) * pitch for k in self.kernels]
         )

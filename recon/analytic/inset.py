@@ -27,7 +27,6 @@ from torchpcct.scan import Scan
 from torchpcct.scene.motion import SinusoidalMotion
 from torchpcct.switches import undisturbed
 from torchpcct.validate import checked, number
-from torchpcct.vector_geometry import VectorGeometry
 from torchpcct.volume import to_hu
 
 __all__ = ["InsetFbp", "require_inside", "static_fbp", "view_motion"]
@@ -182,7 +181,7 @@ class InsetFbp:
             )
         self.motion = motion
         self.circle, path = self.geometry, motion
-        if isinstance(self.geometry, VectorGeometry):
+        if not self.geometry.on_circle:
             self.circle, path = ideal_circle(self.geometry)[:2]
         self.warnings = [
             text for grid in self.grids for text in check_rows(self.circle, grid, path)

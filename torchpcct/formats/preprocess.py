@@ -10,7 +10,6 @@ from torch import Tensor
 
 from torchpcct.checks.defects import repair_defects
 from torchpcct.checks.rotation_axis import RotationAxis, at_axis, rotation_axis
-from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam
 from torchpcct.readings import MEDIAN_TO_SD, bridge
 from torchpcct.scan import Scan
 from torchpcct.validate import checked
@@ -31,11 +30,7 @@ def find_axis(scan: Scan) -> RotationAxis:
             rays, or nothing to be seen.
     """
     g = scan.geometry
-    if (
-        not isinstance(g, ParallelBeam | FanBeam | ConeBeam)
-        or scan.window is not None
-        or scan.counts.ndim > 3
-    ):
+    if not g.on_circle or scan.window is not None or scan.counts.ndim > 3:
         raise ValueError(
             "the axis is found from all columns of a parallel, fan or cone beam on a circle"
         )

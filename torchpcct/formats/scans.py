@@ -22,7 +22,7 @@ from torchpcct.formats.nexus import holds_nexus, read_nexus
 from torchpcct.formats.nikon import read_xtekct
 from torchpcct.formats.stack import read_stack
 from torchpcct.formats.zeiss import read_txrm
-from torchpcct.geometry import Geometry, ParallelBeam
+from torchpcct.geometry import Geometry
 from torchpcct.scan import Scan
 from torchpcct.scan_file import slice_axis, sliced
 from torchpcct.validate import number
@@ -252,7 +252,7 @@ def adapted(
         scan = _sliced(scan, slices)
         g = scan.geometry
     if pitch is not None:
-        if not isinstance(g, ParallelBeam):
+        if not (g.on_circle and g.parallel):
             raise ValueError(
                 f"pitch= is the cell width of parallel beams, this is a {kind}: its geometry says "
                 "it"
@@ -261,7 +261,7 @@ def adapted(
         g = replace(g, pitch=wide, offset=g.offset * wide / g.pitch)
         scan = replace(scan, geometry=g, unit="mm^-1" if scan.unit == "pixel^-1" else scan.unit)
     if axis is not None:
-        if isinstance(g, VectorGeometry) or scan.window is not None:
+        if not g.on_circle or scan.window is not None:
             raise ValueError(
                 f"axis= needs the whole detector of a scan on a circle, this is a {kind}"
             )

@@ -15,7 +15,6 @@ from torch import Tensor
 from torchpcct.metrics.resolution import first_below
 from torchpcct.scan import Scan
 from torchpcct.validate import checked
-from torchpcct.vector_geometry import VectorGeometry
 
 __all__ = ["HalfSplit", "half_split", "halves"]
 
@@ -193,7 +192,7 @@ def halves(scan: Scan) -> tuple[Scan, Scan]:
         raise ValueError("halves of a windowed scan are not provided: acquire it without region")
     angles = scan.geometry.angles
     # known but for whole turns, and those of a helix differ
-    if isinstance(scan.geometry, VectorGeometry):
+    if not scan.geometry.on_circle:
         angles = np.unwrap(angles)
     order = np.argsort(angles, kind="stable")
     if order.size < 2:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
+from torchpcct.geometry import Geometry, ParallelBeam, VolumeGrid, beam
 
 __all__ = ["Rays", "Segments", "check_pair", "check_source", "rays_of", "slab_lattice", "split"]
 
@@ -93,13 +93,10 @@ def check_pair(geometry: Any, grid: Any, window: Any) -> None:
         ValueError: a 3-D grid with a 2-D geometry or the reverse, a window that does not fit the
             detector.
     """
-    if not isinstance(geometry, ParallelBeam | FanBeam | ConeBeam):
-        raise TypeError(
-            f"geometry must be ParallelBeam, FanBeam or ConeBeam, got {type(geometry).__name__}"
-        )
+    geometry = beam(geometry)
     if not isinstance(grid, VolumeGrid):
         raise TypeError(f"grid must be a VolumeGrid, got {type(grid).__name__}")
-    axes = 3 if isinstance(geometry, ConeBeam) else 2
+    axes = 3 if geometry.has_rows else 2
     if grid.ndim != axes:
         raise ValueError(
             f"{type(geometry).__name__} needs a {axes}-D grid, got shape {grid.shape}: "
@@ -118,27 +115,22 @@ def check_pair(geometry: Any, grid: Any, window: Any) -> None:
 
 def rays_of(geometry: Geometry, window: DetectorWindow | None = None) -> Rays:
     """The rays of a circular scan (see :class:`Rays`)."""
+    geometry = beam(geometry)
     views, columns = geometry.views, geometry.columns
     beta = geometry.angles
     radial = np.stack([np.cos(beta), np.sin(beta)], axis=1)
     tangent = np.stack([-np.sin(beta), np.cos(beta)], axis=1)
     row_edge, row_pitch, rows = -0.5, 1.0, 1
-    centers = geometry.column_positions  # type: ignore[attr-defined]
-    pitch = geometry.pitch  # type: ignore[attr-defined]
-    if isinstance(geometry, ConeBeam):
-        row_edge, row_pitch, rows = (
-            geometry.row_positions[0] - pitch[0] / 2,
-            pitch[0],
-            geometry.rows,
-        )
-        pitch = pitch[1]
+    centers, pitch = geometry.column_positions, geometry.column_pitch
+    if geometry.has_rows:
+        row_pitch, rows = geometry.row_pitch, geometry.row_positions.size
+        row_edge = geometry.row_positions[0] - row_pitch / 2
     edges = np.append(centers - pitch / 2, centers[-1] + pitch / 2)
     source = np.zeros((views, 3))
     if isinstance(geometry, ParallelBeam):
         axial = -radial
         table = [np.stack([np.ones(t.size), t], axis=1) for t in (edges, centers)]
     else:
-        assert isinstance(geometry, FanBeam | ConeBeam)
         source[:, :2] = geometry.sod * radial
         axial = -geometry.sdd * radial
         if geometry.detector == "curved":
@@ -152,7 +144,7 @@ def rays_of(geometry: Geometry, window: DetectorWindow | None = None) -> Rays:
             table = [np.stack([np.ones(t.size), t], axis=1) for t in (edges, centers)]
     first = np.zeros(views, dtype=np.int64) if window is None else np.asarray(window.first_column)
     return Rays(
-        parallel=isinstance(geometry, ParallelBeam),
+        parallel=geometry.parallel,
         source=source,
         axial=axial,
         across=tangent,

@@ -67,7 +67,8 @@ class Scene:
         bodies: ``B`` bodies, parents before their children, names unique.
         motion: one :class:`SinusoidalMotion` or several; each moves a body with everything inside
             it, and a body inside two moving ones is displaced by the sum.
-        validate: check on construction that children lie inside their parents and siblings apart
+        validate: check on construction that bodies lie inside their parents and that bodies of
+            one parent do not overlap
             (:meth:`validate`).
 
     Raises:
@@ -239,8 +240,8 @@ class Scene:
         return shifts
 
     def validate(self, samples: int = 2000) -> None:
-        """Check by about ``samples`` surface points a body that bodies nest: children inside
-        parents, siblings apart.
+        """Check by about ``samples`` surface points a body that each body lies inside its
+        parent, and that bodies of one parent do not overlap.
 
         Touching is allowed (to 1e-7 of a body's size); a moving body is checked at rest and at both
         ends of its way. A body too small to be hit by its sibling's samples is found by its own.
