@@ -312,7 +312,7 @@ class _Bench:
         return Reader(self.draws.task, self.draws.task.truth(self.draws.facts))
 
     def scan(self, signal: str) -> None:
-        self.draws.task.scan(self.draws.store, signal)
+        self.draws.task.prepare(self.draws.store, signal)
 
     def facts(self) -> None:
         _ = self.draws.facts

@@ -229,6 +229,11 @@ class Task:
             store.keep_scan(made, path)
         return Scan.load(path)
 
+    def prepare(self, store: Store, signal: str) -> None:
+        """Simulate and keep what the scan with the signal ``"present"`` or ``"absent"`` is made
+        of: a job of its own."""
+        self.scan(store, signal)
+
     def scan_file(self, store: Store, name: str) -> Path:
         """Where a noise-free scan is kept; those of the task before it was changed are removed."""
         path = store.path(f"{name}-{self.fingerprint}.h5")

@@ -239,14 +239,22 @@ class VesselTask(Task):
         return Vessel(line, self.grid.center, branch)
 
     def scan(self, store: Store, signal: str) -> Scan:
-        """See :meth:`Task.scan`: of the same plaque along z, on the same scanner."""
+        """See :meth:`Task.scan`."""
+        present, absent = self.scans(store)
+        return present if signal == "present" else absent
+
+    def prepare(self, store: Store, signal: str) -> None:
+        """See :meth:`Task.prepare`: the scan of the same plaque along z, on the same scanner."""
+        self._along_z(store, signal)
+
+    def _along_z(self, store: Store, signal: str) -> Scan:
         return super().scan(Store(store.folder / "straight"), signal)
 
     def scans(self, store: Store) -> tuple[Scan, Scan]:
         """See :meth:`Task.scans`."""
         paths = [self.scan_file(store, name) for name in ("present", "absent")]
         if not all(p.exists() for p in paths):
-            straight = super().scans(store)
+            straight = self._along_z(store, "present"), self._along_z(store, "absent")
             facts = self._facts_of(*straight)
             values = {
                 ("core" if t == "signal" else t): v
@@ -265,7 +273,7 @@ class VesselTask(Task):
 
     def facts(self, store: Store) -> Facts:
         """Of the vessel along z: values and limit of other directions differ little."""
-        return self._facts_of(*super().scans(store))
+        return self._facts_of(self._along_z(store, "present"), self._along_z(store, "absent"))
 
     @cached_property
     def shares(self) -> dict[str, Floats]:

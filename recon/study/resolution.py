@@ -276,7 +276,7 @@ def point_width(image: NDArray[np.float64], grid: VolumeGrid) -> dict[str, float
 
 def blur(image: Tensor, sigma_px: float) -> Tensor:
     """Gaussian blur of an image ``(y, x)``, cut at 4 σ, with its border repeated; 0 returns the
-    image."""
+    image. Differentiable: kornia's filter of tensors, which is all that is used of kornia."""
     if sigma_px == 0:
         return image
     from kornia.filters import gaussian_blur2d

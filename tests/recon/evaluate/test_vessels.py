@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from recon.evaluate.task import Task
 from recon.evaluate.tasks import TASKS, VesselTask, read_task
 from recon.evaluate.vessels import SHAPES, Vessel
+from recon.jobs.store import Store
 from torchpcct import VolumeGrid
 from torchpcct.scene.plaque import Plaque
 from torchpcct.scene.raster import label_fractions
@@ -123,3 +125,17 @@ def test_label_fractions_of_boxes_and_slivers_are_exact_and_bad_labels_are_named
         label_fractions(layers, 2, (6, 6, 6))
     with pytest.raises(ValueError, match="count"):
         label_fractions(layers, 0, grid)
+
+
+def test_its_scan_is_that_of_the_vessel_and_what_it_is_made_of_is_prepared_apart(
+    monkeypatch, tmp_path
+):
+    """:meth:`Task.scan` of any task is one of :meth:`Task.scans`; the vessel along z is not."""
+    asked = []
+    monkeypatch.setattr(VesselTask, "scans", lambda self, store: ("with", "without"))
+    monkeypatch.setattr(Task, "scan", lambda self, store, signal: asked.append((store, signal)))
+    task, store = read_task("tilted"), Store(tmp_path)
+    assert [task.scan(store, s) for s in ("present", "absent")] == ["with", "without"]
+    assert not asked
+    task.prepare(store, "absent")
+    assert [(s.folder, signal) for s, signal in asked] == [(tmp_path / "straight", "absent")]
