@@ -15,7 +15,7 @@ from recon.analytic.detector_edges import cut_off, reach
 from torchpcct.angles import SAME_VIEW, is_offset
 from torchpcct.checks.defects import BRIGHT
 from torchpcct.detector_window import footprint
-from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid, view_step
+from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid, beam, view_step
 from torchpcct.scan import Scan
 from torchpcct.validate import checked
 from torchpcct.vector_geometry import VectorGeometry
@@ -178,6 +178,7 @@ def sampling_warnings(geometry: Geometry) -> list[str]:
     Returns:
         Warnings; empty if the views suffice.
     """
+    geometry = beam(geometry)
     cell, radius = geometry.cell, geometry.fov_radius
     if geometry.parallel:
         radius = float(np.abs(geometry.column_positions).max())

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from torchpcct.acquisition.scanner_yaml import scanner_of
 from torchpcct.formats.damage import read_yaml
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scanner import presets
@@ -47,7 +48,8 @@ scene:
       material: iodine 10 mg/ml in blood
       parent: patient
 scanner:
-  preset: pcct              # pcct or eid
+  preset: pcct              # pcct or eid; one of your own (geometry, source, detector, filters):
+                            # see the how-to "Your own scanner"
   views: 984
   rows: 16
   columns: 1500
@@ -75,7 +77,8 @@ class SimulationConfig:
         scene, scanner, region: objects for :func:`torchpcct.acquire`; region None: the whole
             detector.
         exposure_s, seed, tolerance_hu: numbers for it.
-        values: the resolved YAML mapping, with every default.
+        values: the resolved YAML mapping, with every default of a preset scanner; a scanner of
+            one's own as it was given.
     """
 
     scene: Scene | VoxelScene
@@ -109,7 +112,7 @@ def configured(values: Mapping[str, Any], folder: Path) -> SimulationConfig:
     """
     values = _mapping("the configuration", values, _KEYS)
     scene, scene_values = _scene(values.get("scene"), folder)
-    scanner, scanner_values = _scanner(values.get("scanner"))
+    scanner, scanner_values = _scanner(values.get("scanner"), folder)
     region = values.get("region")
     grid = None if region is None else grid_of("region", region)
     exposure, seed = values.get("exposure_s"), values.get("seed", 0)
@@ -187,8 +190,10 @@ def _made(name: str, function: Any, given: Mapping[str, Any], order: str = "xyz"
     return function(**given)
 
 
-def _scanner(value: Any) -> tuple[Scanner, dict[str, Any]]:
+def _scanner(value: Any, folder: Path) -> tuple[Scanner, dict[str, Any]]:
     given = dict(value) if isinstance(value, Mapping) else {}
+    if "geometry" in given:
+        return scanner_of(given, folder), given
     preset = choice(
         "scanner.preset", given.pop("preset", "pcct" if value is None else None), tuple(_PRESETS)
     )
