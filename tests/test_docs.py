@@ -215,10 +215,10 @@ def test_the_limits_say_what_the_hard_cases_say():
     text = " ".join((ROOT / "notebooks/docs/limits.md").read_text(encoding="utf-8").split())
     unseen, rows = report["verdicts"].get("unseen", 0), len(report["rows"])
     assert (
-        f"* {unseen} of the {rows} results of the hard cases are wrong in a way that the data "
-        "cannot show" in text
+        f"* {unseen} of the {rows} results of the hard cases are wrong through an error that "
+        "these data cannot reveal" in text
     )
-    assert f"; {report['silent']} are wrong without a word otherwise." in text
+    assert f"; {report['silent']} are wrong without a warning although the data could have" in text
 
 
 def test_the_readme_has_few_figures():

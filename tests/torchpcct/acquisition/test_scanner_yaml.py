@@ -108,9 +108,7 @@ def test_what_lacks_or_is_unknown_is_named(values, tmp_path):
         scanner_of({k: v for k, v in values.items() if k != "detector"})
     with pytest.raises(TypeError, match=r"scanner\.filters must be a mapping such as"):
         scanner_of({**values, "filters": [["copper", 0.2]]})
-    with pytest.raises(
-        ValueError, match=r"unknown scanner\.bowtie 'small': use"
-    ):
+    with pytest.raises(ValueError, match=r"unknown scanner\.bowtie 'small': use"):
         scanner_of({**values, "bowtie": "small"})
     (tmp_path / "one.txt").write_text("20\n40\n", encoding="utf-8")
     with pytest.raises(ValueError, match="must hold two columns"):
