@@ -16,12 +16,13 @@ from torch import Tensor
 
 from torchpcct.acquisition.bodies import Bodies
 from torchpcct.acquisition.plan import Plan, make_plan
+from torchpcct.acquisition.spectra import signal_spectra
 from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, Beam, compress, expected_readings
 from torchpcct.acquisition.transmission import sub_rays as sub_rays_of
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, VolumeGrid
 from torchpcct.projector import Projector
-from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan, check_exposure
+from torchpcct.scan import Scan, check_exposure
 from torchpcct.scanner.scanner import Scanner
 from torchpcct.scene.scene import Scene
 from torchpcct.scene.voxels import VoxelScene
@@ -129,16 +130,17 @@ def acquire(
     bodies = Bodies.of(scene, g, exposure_s if rotation_s is None else rotation_s, duty)
     plan_ = make_plan(bodies, scanner, region, tolerance_hu, sub_rays)
     log.info("%s", plan_.table())
-    energies, spectra, air = signal_spectra(scanner)
-    beam = Beam(spectra, scanner.row_factor, scanner.source.focal_spot, plan_.points)
+    energies, _, air = signal_spectra(scanner)
+    energies_used = energies[plan_.nodes.index]
+    beam = Beam(plan_.nodes.spectra, scanner.row_factor, scanner.source.focal_spot, plan_.points)
     # One view for all: the densest sampling of every effect costs nothing here.
     dense, one = beam._replace(points=sub_rays_of(SUB_RAY_COUNTS[-1])), g.select([0])
-    symmetric, step = bodies.symmetric(energies, one), np.array([bodies.view_step])
+    symmetric, step = bodies.symmetric(energies_used, one), np.array([bodies.view_step])
     surround = expected_readings(one, DetectorWindow.full(one), symmetric, dense, step).numpy()[
         :, 0
     ]
     counts = _readings(
-        plan_, bodies, scanner, energies, beam, surround, progress, keep or _computed
+        plan_, bodies, scanner, energies_used, beam, surround, progress, keep or _computed
     )
     info = {
         "scanner": scanner.name,
@@ -264,20 +266,6 @@ def _voxel_readings(lines: Tensor, spectrum: Tensor, weight: Tensor) -> Tensor:
         cells = transmitted.view(-1, _SUB_COLUMNS, spectrum.shape[1]).sum(1)
         out[:, r] = (weight * cells).sum(-1)
     return out
-
-
-def signal_spectra(scanner: Scanner) -> tuple[Any, Any, Any]:
-    """Energies, ``(bins, columns, energies)`` signal per energy in air, and the air readings
-    ``(bins, rows, columns)``.
-
-    Of an energy-integrating detector the variance follows as one more "bin": the same transmission,
-    weighted by the squared signal.
-    """
-    energies, spectra = scanner.weights()
-    if scanner.detector.energy_integrating:
-        spectra = np.concatenate([spectra, scanner.noise_weights()[1]])
-    spectra = spectra * scanner.mas_per_view(NOISE_FREE_EXPOSURE_S)
-    return energies, spectra, np.einsum("bce,r->brc", spectra, scanner.row_factor)
 
 
 def detected(

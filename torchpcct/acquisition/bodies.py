@@ -127,6 +127,18 @@ class Bodies:
         contrast = self.scene.contrast(energies)[self.order]
         return BodySet(self.kinds, self.params, contrast, offsets, drift, self.circle)
 
+    def attenuation(self, energies: ArrayLike, geometry: ConeBeam) -> tuple[Floats, Floats]:
+        """Attenuation of the scene's materials, ``(materials, energies)`` in mm⁻¹, and the longest
+        path of a ray in each, ``(materials,)`` in mm, or more."""
+        stretch = np.hypot(1.0, np.abs(geometry.row_positions).max() / geometry.sdd)
+        boxes = np.array([shape.bounding_box[:, :2] for shape in self.scene.shapes])
+        widths = np.ptp(np.clip(boxes, -geometry.sod, geometry.sod), axis=1)
+        paths = np.hypot(widths[:, 0], widths[:, 1]) * stretch
+        mu = np.stack([m.attenuation(energies) for m in self.scene.materials])
+        mu, material = np.unique(mu, axis=0, return_inverse=True)
+        longest = np.bincount(material.ravel(), paths)
+        return mu, np.minimum(longest, 2.0 * geometry.sod * stretch)
+
     def symmetric(self, energies: ArrayLike, geometry: ConeBeam) -> BodySet:
         """Only the rotationally symmetric bodies, which all views see alike; there may be none."""
         rest = slice(self.varying, None)

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from torchpcct.acquisition.bodies import Bodies
+from torchpcct.acquisition.spectra import Nodes, energy_nodes, signal_spectra
 from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, Beam, expected_readings, sub_rays
 from torchpcct.detector_window import NOISE_MARGIN_COLUMNS, DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, VolumeGrid
@@ -69,6 +70,7 @@ class Plan:
     Attributes:
         effects: every effect with its cost in HU (rms over the footprint of the inset, per its mean
             chord).
+        nodes: energies that stand for the spectrum.
         points: ``(sub-rays, 5)`` beam samples of
             :func:`torchpcct.acquisition.transmission.sub_rays`.
         active: the readings that see the varying bodies; None: no view differs from another.
@@ -80,6 +82,7 @@ class Plan:
     """
 
     effects: tuple[Effect, ...]
+    nodes: Nodes
     points: Any
     active: DetectorWindow | None
     kept: DetectorWindow | None
@@ -113,6 +116,7 @@ class Plan:
         return {
             "tolerance_hu": self.tolerance_hu,
             "effects": [vars(e) for e in self.effects],
+            "energies": len(self.nodes.index),
             "sub_rays": len(self.points),
             "sampling_error_of_peak": self.sampling_error,
             "readings": self.readings,
@@ -163,6 +167,7 @@ class _Probe:
         rows = min(_PROBE_ROWS, seen.rows)
         self.window = seen.with_rows(seen.first_row + (seen.rows - rows) // 2, rows)
         self.bodies, self.scanner = bodies, scanner
+        self.energies, self.spectra, _ = signal_spectra(scanner)
         self.seconds = 0.0
 
     def run(
@@ -173,6 +178,7 @@ class _Probe:
         background: bool = False,
         mono: bool = False,
         still: bool = False,
+        nodes: Nodes | None = None,
     ) -> Any:
         """Line integrals of the probe, ``(views, rows, columns)``.
 
@@ -180,9 +186,14 @@ class _Probe:
             active, count: of :func:`~torchpcct.acquisition.transmission.sub_rays`.
             background: without the bodies that vary. mono: at the mean energy. still: as if nothing
                 moved.
+            nodes: energies that stand for the spectrum; None: all of them.
         """
-        energies, spectra = self.scanner.weights()
-        spectra = spectra.sum(0, keepdims=True)
+        energies, bins = self.energies, self.scanner.detector.bins
+        spectra = self.spectra[:bins].sum(0, keepdims=True)
+        air = np.einsum("bce,r->rc", spectra, self.scanner.row_factor)
+        if nodes is not None:
+            energies = energies[nodes.index]
+            spectra = nodes.spectra[:bins].sum(0, keepdims=True)
         if mono:
             mean = np.einsum("bce,e->bc", spectra, energies) / spectra.sum(-1)
             energies = np.array([float(mean.mean())])
@@ -204,7 +215,6 @@ class _Probe:
             g, w, bodies, beam, np.full(g.views, self.bodies.view_step)
         ).numpy()
         self.seconds = time.perf_counter() - start
-        air = np.einsum("bce,r->rc", spectra, self.scanner.row_factor)
         air = air[w.first_row : w.first_row + w.rows][:, w.column_indices].transpose(1, 0, 2)
         return np.log(air) - np.log(readings[0])
 
@@ -257,7 +267,6 @@ def make_plan(
     everything = (True,) * 5
     probe.run(everything, 16)  # compile, so that the time measured below is run time
     reference = probe.run(everything, _EFFECT_SUB_RAYS)
-    per_ray = probe.seconds / (reference.size * _EFFECT_SUB_RAYS)
     inset = reference - probe.run(everything, 16, background=True)
     peak = float(np.abs(inset).max())
     mask = np.abs(inset) > 1e-3 * peak
@@ -311,17 +320,26 @@ def make_plan(
         if error <= _PEAK_ERROR:
             break
     points = sub_rays(count, chosen)
+    nodes = energy_nodes(*bodies.attenuation(probe.energies, g), probe.spectra)
+    fewer = probe.run(chosen, count, nodes=nodes)
+    per_reading = probe.seconds / fewer.size
+    omitted = cost(fewer - probe.run(chosen, count))
+    if omitted > tolerance_hu:
+        nodes = Nodes.all_of(probe.spectra)
+    number_of = f"{len(nodes.index)} of {len(probe.energies)} energies"
+    effects.insert(1, Effect("every energy", omitted > tolerance_hu, omitted, number_of))
     window = active_window(g, bodies) if bodies.varying else None
     busy = g.rows * g.columns if window is None else math.prod(window.shape)
     held = math.prod(g.shape if kept is None else kept.shape)
     return Plan(
         effects=tuple(effects),
+        nodes=nodes,
         points=points,
         active=window,
         kept=kept,
         sampling_error=error,
         readings=held,
-        seconds=busy * len(points) * per_ray + held * 8e-9,
+        seconds=busy * per_reading + held * 8e-9,
         bytes=held * 4 * 2 + busy * 8,
         tolerance_hu=tolerance_hu,
     )

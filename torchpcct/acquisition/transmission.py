@@ -34,7 +34,8 @@ from torchpcct.acquisition.bodies import BodySet
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam
 from torchpcct.kernel_cache import forget_outdated
-from torchpcct.scene.chords import PARAMETERS, interval
+from torchpcct.scene.chord_kernels import chords_from, may_meet
+from torchpcct.scene.chords import PARAMETERS
 from torchpcct.threads import run
 from torchpcct.validate import shaped
 
@@ -128,7 +129,119 @@ def compress(
     return np.ascontiguousarray(coefficients), np.ascontiguousarray(basis)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+_FAST = {"contract", "arcp", "nsz"}
+"""What the compiler may change in sums: fusing a product and a sum, a reciprocal for a division."""
+_LANES = 32
+"""Readings computed side by side at least, so that their loops fill the processor's vectors."""
+_MOST_LANES = 64
+"""Readings computed side by side at most, so that what is held of them stays in the cache."""
+
+
+@njit(inline="always", fastmath=_FAST, error_model="numpy")
+def _exp(x: float) -> float:
+    """``exp(x)`` to 2.3e-16 for x below 700, without branches; 3e-308 in place of anything less.
+
+    ``x = k ln 2 + r`` with ``|r| <= ln(2) / 2``: a Taylor series for ``exp(r)``, and ``k`` as the
+    exponent of a double. Adding 1.5 · 2^52 rounds to a whole number, which is then in the low bits.
+    """
+    x = max(x, -708.0)
+    shifted = x * 1.4426950408889634 + 6755399441055744.0
+    k = shifted - 6755399441055744.0
+    r = (x - k * 0.693147180369123816490) - k * 1.90821492927058770002e-10
+    series = 1.0 / 479001600.0
+    series = series * r + 1.0 / 39916800.0
+    series = series * r + 1.0 / 3628800.0
+    series = series * r + 1.0 / 362880.0
+    series = series * r + 1.0 / 40320.0
+    series = series * r + 1.0 / 5040.0
+    series = series * r + 1.0 / 720.0
+    series = series * r + 1.0 / 120.0
+    series = series * r + 1.0 / 24.0
+    series = series * r + 1.0 / 6.0
+    series = series * r + 0.5
+    series = series * r + 1.0
+    series = series * r + 1.0
+    bits = (np.float64(shifted).view(np.int64) + 1023) << 52
+    return series * np.int64(bits).view(np.float64)
+
+
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _moments(samples: Any, count: int, lanes: int, mean: Any, spread: Any) -> None:
+    """Mean ``(rank, lanes)`` and covariance, ``(pairs, lanes)`` with both of a mixed pair, of
+    ``samples (count, rank, lanes)``; samples become deviations from the first one."""
+    rank = samples.shape[1]
+    for a in range(rank):
+        for n in range(lanes):
+            mean[a, n] = 0.0
+    for pair in range(spread.shape[0]):
+        for n in range(lanes):
+            spread[pair, n] = 0.0
+    # Sums relative to the first sub-ray keep the digits of the small spread.
+    for k in range(1, count):
+        pair = 0
+        for a in range(rank):
+            for n in range(lanes):
+                samples[k, a, n] -= samples[0, a, n]
+                mean[a, n] += samples[k, a, n]
+            for c in range(a + 1):
+                for n in range(lanes):
+                    spread[pair, n] += samples[k, a, n] * samples[k, c, n]
+                pair += 1
+    inverse = 1.0 / count
+    pair = 0
+    for a in range(rank):
+        for n in range(lanes):
+            mean[a, n] *= inverse
+        for c in range(a + 1):
+            twice = 1.0 if c == a else 2.0
+            for n in range(lanes):
+                spread[pair, n] = twice * (spread[pair, n] * inverse - mean[a, n] * mean[c, n])
+            pair += 1
+    for a in range(rank):
+        for n in range(lanes):
+            mean[a, n] += samples[0, a, n]
+
+
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _transmitted(
+    samples: Any, count: int, lanes: int, mean: Any, spread: Any, basis: Any, e: int, out: Any
+) -> None:
+    """Mean transmission of each reading at energy ``e``: to second order, or the full sum."""
+    rank = basis.shape[0]
+    exponent, variance = out[0], out[1]
+    for n in range(lanes):
+        exponent[n] = 0.0
+        variance[n] = 0.0
+    pair = 0
+    for a in range(rank):
+        share, line = basis[a, e], mean[a]
+        for n in range(lanes):
+            exponent[n] -= share * line[n]
+        for c in range(a + 1):
+            product, both = 0.5 * basis[a, e] * basis[c, e], spread[pair]
+            for n in range(lanes):
+                variance[n] += product * both[n]
+            pair += 1
+    for n in range(lanes):
+        exponent[n] = _exp(exponent[n] + variance[n])
+    large = 0
+    for n in range(lanes):
+        large += variance[n] > 0.5 * LARGE_VARIANCE
+    if not large:
+        return
+    for n in range(lanes):
+        if variance[n] <= 0.5 * LARGE_VARIANCE:
+            continue
+        total = 0.0
+        for k in range(count):
+            path = 0.0
+            for a in range(rank):
+                path += (samples[0, a, n] + (samples[k, a, n] if k else 0.0)) * basis[a, e]
+            total += _exp(-path)
+        exponent[n] = total / count
+
+
+@njit(nogil=True, cache=True, fastmath=_FAST, error_model="numpy")
 def _readings(
     begin: int,
     end: int,
@@ -136,10 +249,7 @@ def _readings(
     sin_b: Any,
     view_step: Any,
     sod: float,
-    sdd: float,
-    curved: bool,
-    u0: float,
-    du: float,
+    across: Any,
     v0: float,
     dv: float,
     focal_w: float,
@@ -161,125 +271,124 @@ def _readings(
     out: Any,
 ) -> None:
     bins, _, rows, columns = out.shape
-    energies = basis.shape[1]
-    rank = basis.shape[0]
+    rank, energies = basis.shape
     bodies = kinds.size
     count = points.shape[0]
     has_surround = surround.shape[0] > 0
+    # Readings side by side: some columns, and for each of them some rows, which follow each other.
+    high = min(rows, _MOST_LANES)
+    wide = max(1, _LANES // high)
+    most = high * wide
+    seen = np.empty(columns, np.int64)
+    source = np.empty((count, 5))
+    dx, dy, dz, stretch = np.empty(most), np.empty(most), np.empty(most), np.empty(most)
+    chord = np.empty(most)
+    samples = np.empty((count, rank, most))
+    mean = np.empty((rank, most))
+    spread = np.empty((rank * (rank + 1) // 2, most))
+    transmitted = np.empty((2, most))
+    totals = np.empty((bins, most))
     for view in range(begin, end):
-        mean = np.empty(rank)
-        start = np.empty(rank)
-        sample = np.empty(rank)
-        deltas = np.empty((count, rank))
-        spread = np.empty((rank, rank))
         cb, sb = cos_b[view], sin_b[view]
-        for row in range(rows):
-            v_mid = v0 + (first_row + row) * dv
-            for j in range(columns):
-                column = first_column[view] + j
-                u_mid = u0 + column * du
-                if has_surround:
-                    # Distance of the centre ray from the bodies' circle: most readings pass far
-                    # outside.
-                    if curved:
-                        gamma = u_mid / sdd
-                        lx, ly = -math.cos(gamma), math.sin(gamma)
-                    else:
-                        norm = 1.0 / math.sqrt(sdd * sdd + u_mid * u_mid)
-                        lx, ly = -sdd * norm, u_mid * norm
-                    sx = circle[0] + offsets[0, view, 0] - sod * cb
-                    sy = circle[1] + offsets[0, view, 1] - sod * sb
-                    if abs(sx * (lx * sb + ly * cb) - sy * (lx * cb - ly * sb)) > circle[2] + reach:
-                        for b in range(bins):
+        for k in range(count):
+            turn = points[k, 4] * view_step[view]
+            ct, st = math.cos(turn), math.sin(turn)
+            cos_v, sin_v = cb * ct - sb * st, sb * ct + cb * st
+            # Source in the turning frame: sod along e_r, sy along e_t.
+            sy = points[k, 0] * focal_w
+            source[k, 0], source[k, 1] = cos_v, sin_v
+            source[k, 2] = sod * cos_v - sy * sin_v
+            source[k, 3] = sod * sin_v + sy * cos_v
+            source[k, 4] = points[k, 1] * focal_l
+        found = 0
+        for j in range(columns):
+            column = first_column[view] + j
+            if has_surround:
+                # Distance of the centre ray from the bodies' circle: most readings pass far
+                # outside.
+                lx, ly = across[count, column, 0], across[count, column, 1]
+                sx = circle[0] + offsets[0, view, 0] - sod * cb
+                sy = circle[1] + offsets[0, view, 1] - sod * sb
+                if abs(sx * (lx * sb + ly * cb) - sy * (lx * cb - ly * sb)) > circle[2] + reach:
+                    for b in range(bins):
+                        for row in range(rows):
                             out[b, view, row, j] = surround[b, first_row + row, column]
-                        continue
-                for a in range(rank):
-                    mean[a] = 0.0
-                    for c in range(rank):
-                        spread[a, c] = 0.0
+                    continue
+            seen[found] = j
+            found += 1
+        for block in range(0, found, wide):
+            across_block = min(wide, found - block)
+            for row0 in range(0, rows, high):
+                up = min(high, rows - row0)
+                lanes = across_block * up
                 for k in range(count):
-                    turn = points[k, 4] * view_step[view]
-                    ct, st = math.cos(turn), math.sin(turn)
-                    cos_v, sin_v = cb * ct - sb * st, sb * ct + cb * st
-                    # Source and cell in the turning frame (along e_r, along e_t, z).
-                    sy = points[k, 0] * focal_w
-                    sz = points[k, 1] * focal_l
-                    u = u_mid + points[k, 2] * du
-                    if curved:
-                        gamma = u / sdd
-                        lx, ly = -sdd * math.cos(gamma), sdd * math.sin(gamma) - sy
-                    else:
-                        lx, ly = -sdd, u - sy
-                    lz = v_mid + points[k, 3] * dv - sz
-                    norm = 1.0 / math.sqrt(lx * lx + ly * ly + lz * lz)
-                    dx = (lx * cos_v - ly * sin_v) * norm
-                    dy = (lx * sin_v + ly * cos_v) * norm
-                    dz = lz * norm
-                    ox = sod * cos_v - sy * sin_v
-                    oy = sod * sin_v + sy * cos_v
+                    cos_v, sin_v = source[k, 0], source[k, 1]
+                    ox, oy, oz = source[k, 2], source[k, 3], source[k, 4]
+                    bottom = v0 + points[k, 3] * dv - oz + (first_row + row0) * dv
+                    for i in range(across_block):
+                        column = first_column[view] + seen[block + i]
+                        lx, ly = across[k, column, 0], across[k, column, 1]
+                        inverse = across[k, column, 2]
+                        x, y = lx * cos_v - ly * sin_v, lx * sin_v + ly * cos_v
+                        low, step = bottom * inverse, dv * inverse
+                        for r in range(up):
+                            dx[i * up + r] = x
+                            dy[i * up + r] = y
+                            dz[i * up + r] = low + r * step
+                    for n in range(lanes):
+                        stretch[n] = math.sqrt(1.0 + dz[n] * dz[n])
                     for a in range(rank):
-                        sample[a] = 0.0
+                        for n in range(lanes):
+                            samples[k, a, n] = 0.0
                     for b in range(bodies):
                         t = points[k, 4]
-                        t0, t1 = interval(
-                            kinds[b],
-                            params[b],
-                            ox - offsets[b, view, 0] - t * drift[b, view, 0],
-                            oy - offsets[b, view, 1] - t * drift[b, view, 1],
-                            sz - offsets[b, view, 2] - t * drift[b, view, 2],
-                            dx,
-                            dy,
-                            dz,
+                        bx = ox - offsets[b, view, 0] - t * drift[b, view, 0]
+                        by = oy - offsets[b, view, 1] - t * drift[b, view, 1]
+                        bz = oz - offsets[b, view, 2] - t * drift[b, view, 2]
+                        meets = False
+                        for i in range(across_block):
+                            meets |= may_meet(params, b, bx, by, dx[i * up], dy[i * up])
+                        if not meets:
+                            continue
+                        chords_from(
+                            kinds[b], params, b, bx, by, bz, dx, dy, dz, stretch, lanes, chord
                         )
-                        if t1 > t0:
-                            for a in range(rank):
-                                sample[a] += (t1 - t0) * coefficients[b, a]
-                    # Sums relative to the first sub-ray keep the digits of the small spread.
-                    if k == 0:
                         for a in range(rank):
-                            start[a] = sample[a]
-                            deltas[0, a] = 0.0
-                    else:
-                        for a in range(rank):
-                            delta = sample[a] - start[a]
-                            deltas[k, a] = delta
-                            mean[a] += delta
-                            for c in range(a + 1):
-                                spread[a, c] += delta * (sample[c] - start[c])
-                for a in range(rank):
-                    mean[a] /= count
-                for a in range(rank):
-                    for c in range(a + 1):
-                        spread[a, c] = spread[a, c] / count - mean[a] * mean[c]
-                        if c < a:
-                            spread[a, c] *= 2.0
-                for a in range(rank):
-                    mean[a] += start[a]
+                            share = coefficients[b, a]
+                            for n in range(lanes):
+                                samples[k, a, n] += share * chord[n]
+                _moments(samples, count, lanes, mean, spread)
                 for b in range(bins):
-                    out[b, view, row, j] = 0.0
+                    for n in range(lanes):
+                        totals[b, n] = 0.0
                 for e in range(energies):
-                    p = 0.0
-                    variance = 0.0
-                    for a in range(rank):
-                        p += mean[a] * basis[a, e]
-                        for c in range(a + 1):
-                            variance += spread[a, c] * basis[a, e] * basis[c, e]
-                    if variance <= LARGE_VARIANCE:
-                        transmitted = math.exp(0.5 * variance - p)
-                    else:
-                        base = 0.0
-                        for a in range(rank):
-                            base += start[a] * basis[a, e]
-                        transmitted = 0.0
-                        for k in range(count):
-                            line = base
-                            for a in range(rank):
-                                line += deltas[k, a] * basis[a, e]
-                            transmitted += math.exp(-line)
-                        transmitted /= count
-                    transmitted *= row_factor[first_row + row]
+                    _transmitted(samples, count, lanes, mean, spread, basis, e, transmitted)
                     for b in range(bins):
-                        out[b, view, row, j] += spectra[b, column, e] * transmitted
+                        for i in range(across_block):
+                            weight = spectra[b, first_column[view] + seen[block + i], e]
+                            for r in range(up):
+                                totals[b, i * up + r] += weight * transmitted[0, i * up + r]
+                for b in range(bins):
+                    for i in range(across_block):
+                        for r in range(up):
+                            out[b, view, row0 + r, seen[block + i]] = (
+                                totals[b, i * up + r] * row_factor[first_row + row0 + r]
+                            )
+
+
+def _across(geometry: ConeBeam, focal_width: float, points: Floats) -> Floats:
+    """Directions in the plane of the rays to every column, ``(sub-rays + 1, columns, 3)``: unit
+    vector along e_r and e_t, and 1 over the length in mm; the last are those of the centre rays."""
+    aim = np.concatenate([points[:, [0, 2]], np.zeros((1, 2))])
+    u = geometry.column_positions + aim[:, 1:] * geometry.pitch[1]
+    if geometry.detector == "curved":
+        along = -geometry.sdd * np.cos(u / geometry.sdd)
+        u = geometry.sdd * np.sin(u / geometry.sdd)
+    else:
+        along = np.full_like(u, -geometry.sdd)
+    beside = u - aim[:, :1] * focal_width
+    inverse = 1.0 / np.hypot(along, beside)
+    return np.stack([along * inverse, beside * inverse, inverse], axis=-1)
 
 
 def expected_readings(
@@ -339,10 +448,7 @@ def expected_readings(
         np.sin(geometry.angles),
         np.ascontiguousarray(view_step),
         geometry.sod,
-        geometry.sdd,
-        geometry.detector == "curved",
-        geometry.column_positions[0],
-        du,
+        _across(geometry, beam.focal_spot[0], beam.points),
         geometry.row_positions[0],
         dv,
         *beam.focal_spot,

@@ -1,4 +1,9 @@
-"""The kernels behind :mod:`torchpcct.scene.chords`: one ray through one packed shape.
+"""The kernels behind :mod:`torchpcct.scene.chords`: one ray, or many from one point, through one
+packed shape.
+
+:func:`interval` finds both ends of a chord of any ray. :func:`chords_from` gives the chords of many
+rays of one source at once, as loops without branches that the compiler turns into SIMD; the few
+rays that need more care (grazing, steep) go the way of :func:`interval`.
 
 In a tube's section coordinates ``u = X s_x - 1``, ``v = y s_y`` with ``X = x + R`` both tubes are
 the unit circle: ``s_x = 1 / (R + d), s_y = 1 / R`` for the bulged one, ``s_x = s_y = (R + d) / R²``
@@ -15,7 +20,17 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BOX", "BULGED", "CYLINDER", "ELLIPSOID", "NARROWED", "chords", "interval"]
+__all__ = [
+    "BOX",
+    "BULGED",
+    "CYLINDER",
+    "ELLIPSOID",
+    "NARROWED",
+    "chords",
+    "chords_from",
+    "interval",
+    "may_meet",
+]
 
 # Kinds of packed shapes.
 ELLIPSOID, CYLINDER, BOX, BULGED, NARROWED = range(5)
@@ -63,22 +78,23 @@ def clip(t0: float, t1: float, lz: float, uz: float, half_length: float) -> Any:
     return (near if near > t0 else t0), (far if far < t1 else t1)
 
 
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+# Inlined and without branches, so that loops over many rays can hold them.
+@numba.njit(inline="always", fastmath=_FAST, error_model="numpy")
 def _level(
     narrowed: bool, X: float, y: float, ux: float, uy: float, radius: float, d: float, slope: float
 ) -> tuple[float, float]:
     """``h`` and ``dh/dt`` where the profile is ``d`` and changes by ``slope`` per mm of the ray."""
-    if narrowed:
-        inverse = 1.0 / (radius * radius)
-        s, ds = (radius + d) * inverse, slope * inverse
-        u, v = X * s - 1.0, y * s
-        return u * u + v * v - 1.0, 2.0 * (u * (ux * s + X * ds) + v * (uy * s + y * ds))
-    s, inverse = 1.0 / (radius + d), 1.0 / radius
-    u, v = X * s - 1.0, y * inverse
-    return u * u + v * v - 1.0, 2.0 * (u * s * (ux - X * s * slope) + v * uy * inverse)
+    inverse = 1.0 / radius
+    widened, thinned = 1.0 / (radius + d), (radius + d) * inverse * inverse
+    sx = thinned if narrowed else widened
+    sy = thinned if narrowed else inverse
+    dsx = slope * inverse * inverse if narrowed else -slope * widened * widened
+    dsy = slope * inverse * inverse if narrowed else 0.0
+    u, v = X * sx - 1.0, y * sy
+    return u * u + v * v - 1.0, 2.0 * (u * (ux * sx + X * dsx) + v * (uy * sy + y * dsy))
 
 
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+@numba.njit(inline="always", fastmath=_FAST, error_model="numpy")
 def _cos_sin(phase: float) -> tuple[float, float]:
     """Cosine and sine of a phase within ±4 to 1e-12: a quarter of the time of two library calls."""
     half = 0.5 * phase
@@ -135,7 +151,7 @@ def _cos_sin(phase: float) -> tuple[float, float]:
     return 2.0 * c * c - 1.0, 2.0 * s * c
 
 
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+@numba.njit(inline="always", fastmath=_FAST, error_model="numpy")
 def _shallow_level(
     narrowed: bool,
     t: float,
@@ -154,22 +170,49 @@ def _shallow_level(
 ) -> tuple[float, float]:
     """``h`` and ``dh/dt`` at ``t`` from the point (X, y, z) whose phase has the cosine ``c0``
     and the sine ``s0``."""
-    d, slope = 0.0, 0.0
-    if abs(z + t * uz) < reach:
-        phase = omega * uz * t
-        q = phase * phase
-        # Taylor series: the phase is small, and a call of sin and cos would cost more than all the
-        # rest.
-        s = phase * (
-            1.0 - q * (1 / 6 - q * (1 / 120 - q * (1 / 5040 - q * (1 / 362880 - q / 39916800))))
-        )
-        c = 1.0 - q * (
-            1 / 2
-            - q * (1 / 24 - q * (1 / 720 - q * (1 / 40320 - q * (1 / 3628800 - q / 479001600))))
-        )
-        d = half_amplitude * (1.0 + (c0 * c - s0 * s))
-        slope = -half_amplitude * omega * uz * (s0 * c + c0 * s)
+    phase = omega * uz * t
+    q = phase * phase
+    # Taylor series: the phase is small, and a call of sin and cos would cost more than all the
+    # rest.
+    s = phase * (
+        1.0 - q * (1 / 6 - q * (1 / 120 - q * (1 / 5040 - q * (1 / 362880 - q / 39916800))))
+    )
+    c = 1.0 - q * (
+        1 / 2 - q * (1 / 24 - q * (1 / 720 - q * (1 / 40320 - q * (1 / 3628800 - q / 479001600))))
+    )
+    bulge = half_amplitude if abs(z + t * uz) < reach else 0.0
+    d = bulge * (1.0 + (c0 * c - s0 * s))
+    slope = -bulge * omega * uz * (s0 * c + c0 * s)
     return _level(narrowed, X + t * ux, y + t * uy, ux, uy, radius, d, slope)
+
+
+@numba.njit(inline="always", fastmath=_FAST, error_model="numpy")
+def _newton(
+    narrowed: bool,
+    t: float,
+    X: float,
+    y: float,
+    z: float,
+    ux: float,
+    uy: float,
+    uz: float,
+    radius: float,
+    half_amplitude: float,
+    omega: float,
+    reach: float,
+    c0: float,
+    s0: float,
+    curvature: float,
+) -> tuple[float, float]:
+    """A step of Newton's method towards ``h = 0`` with ``curvature`` as half the second derivative:
+    where it leads, and its length."""
+    h, slope = _shallow_level(
+        narrowed, t, X, y, z, ux, uy, uz, radius, half_amplitude, omega, reach, c0, s0
+    )
+    inverse = 1.0 / slope
+    step = h * inverse
+    step *= 1.0 + curvature * step * inverse
+    return t - step, step
 
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
@@ -256,19 +299,40 @@ def shallow(
         # derivative. After a step s the error is less than s² / (20 half).
         enough = 2e-10 * half
         for _ in range(30):
-            h0, g0 = _shallow_level(
-                narrowed, t0, X, y, z, ux, uy, uz, radius, half_amplitude, omega, reach, c0, s0
+            t0, step0 = _newton(
+                narrowed,
+                t0,
+                X,
+                y,
+                z,
+                ux,
+                uy,
+                uz,
+                radius,
+                half_amplitude,
+                omega,
+                reach,
+                c0,
+                s0,
+                curvature,
             )
-            h1, g1 = _shallow_level(
-                narrowed, t1, X, y, z, ux, uy, uz, radius, half_amplitude, omega, reach, c0, s0
+            t1, step1 = _newton(
+                narrowed,
+                t1,
+                X,
+                y,
+                z,
+                ux,
+                uy,
+                uz,
+                radius,
+                half_amplitude,
+                omega,
+                reach,
+                c0,
+                s0,
+                curvature,
             )
-            g0, g1 = 1.0 / g0, 1.0 / g1
-            step0, step1 = h0 * g0, h1 * g1
-            step0, step1 = (
-                step0 * (1.0 + curvature * step0 * g0),
-                step1 * (1.0 + curvature * step1 * g1),
-            )
-            t0, t1 = t0 - step0, t1 - step1
             if not step0 * step0 + step1 * step1 > enough:
                 break
     return start + t0, start + t1
@@ -495,3 +559,330 @@ def chords(
         for b in range(kinds.shape[0]):
             t0, t1 = interval(kinds[b], params[b], ox, oy, oz, dx, dy, dz)
             out[b, n] = 0.0 if t1 <= t0 else t1 - t0
+
+
+# --- many rays of one source ----------------------------------------------------------------------
+# A ray is given by its unit direction (dx, dy) in the plane and its climb dz per mm of that plane:
+# all rows of a detector column share dx and dy. Lengths are measured in the plane, and stretched by
+# sqrt(1 + dz²) at the end.
+
+
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+def may_meet(params: Any, b: int, ox: float, oy: float, dx: float, dy: float) -> bool:
+    """Whether rays from a point whose unit direction in the plane is (dx, dy) may meet shape
+    ``b``: they pass through its bounding cylinder, whatever their climb."""
+    cross = (params[b, 0] - ox) * dy - (params[b, 1] - oy) * dx
+    return cross * cross <= params[b, 3]
+
+
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+def chords_from(
+    kind: int,
+    params: Any,
+    b: int,
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: Any,
+    dy: Any,
+    dz: Any,
+    stretch: Any,
+    count: int,
+    out: Any,
+) -> None:
+    """Chords of ``count`` rays from one point in one packed shape.
+
+    Args:
+        kind: of the shape; params, b: row ``b`` of ``params`` is the shape's, see ``pack``.
+        ox, oy, oz: where the rays start, in mm; far outside of the shape, or the part of the chord
+            behind it counts too. Subtract a body's displacement from it.
+        dx, dy, dz: ``(count,)`` or longer, unit direction in the plane and climb.
+        stretch: ``sqrt(1 + dz²)``.
+        count: number of rays.
+        out: chords in mm, 0 for a miss.
+    """
+    x, y, z = ox - params[b, 6], oy - params[b, 7], oz - params[b, 8]
+    lx = params[b, 9] * x + params[b, 10] * y + params[b, 11] * z
+    ly = params[b, 12] * x + params[b, 13] * y + params[b, 14] * z
+    lz = params[b, 15] * x + params[b, 16] * y + params[b, 17] * z
+    if kind == ELLIPSOID:
+        _ellipsoid_chords(params, b, lx, ly, lz, dx, dy, dz, stretch, count, out)
+    elif kind == CYLINDER:
+        _cylinder_chords(params, b, lx, ly, lz, dx, dy, dz, stretch, count, out)
+    elif kind == BOX:
+        _box_chords(params, b, lx, ly, lz, dx, dy, dz, stretch, count, out)
+    else:
+        _tube_chords(kind == NARROWED, params, b, lx, ly, lz, dx, dy, dz, stretch, count, out)
+
+
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _ellipsoid_chords(
+    params: Any,
+    b: int,
+    lx: float,
+    ly: float,
+    lz: float,
+    dx: Any,
+    dy: Any,
+    dz: Any,
+    stretch: Any,
+    count: int,
+    out: Any,
+) -> None:
+    xx, xy, xz = params[b, 9], params[b, 10], params[b, 11]
+    yx, yy, yz = params[b, 12], params[b, 13], params[b, 14]
+    zx, zy, zz = params[b, 15], params[b, 16], params[b, 17]
+    for n in range(count):
+        ux = xx * dx[n] + xy * dy[n] + xz * dz[n]
+        uy = yx * dx[n] + yy * dy[n] + yz * dz[n]
+        uz = zx * dx[n] + zy * dy[n] + zz * dz[n]
+        inverse = 1.0 / (ux * ux + uy * uy + uz * uz)
+        t = -(lx * ux + ly * uy + lz * uz) * inverse
+        x, y, z = lx + t * ux, ly + t * uy, lz + t * uz
+        rest = max(1.0 - (x * x + y * y + z * z), 0.0)
+        out[n] = 2.0 * math.sqrt(rest * inverse) * stretch[n]
+
+
+@numba.njit(inline="always", fastmath=_FAST, error_model="numpy")
+def _clipped(t0: float, t1: float, lz: float, uz: float, half_length: float) -> float:
+    """Length of ``(t0, t1)`` with ``|lz + t uz| <= half_length``, at least 0, without branches."""
+    inverse = 1.0 / uz
+    near, far = (-half_length - lz) * inverse, (half_length - lz) * inverse
+    low, high = min(near, far), max(near, far)
+    inside = abs(lz) <= half_length
+    low = low if uz != 0.0 else (-math.inf if inside else math.inf)
+    high = high if uz != 0.0 else (math.inf if inside else -math.inf)
+    return max(min(t1, high) - max(t0, low), 0.0)
+
+
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _cylinder_chords(
+    params: Any,
+    b: int,
+    lx: float,
+    ly: float,
+    lz: float,
+    dx: Any,
+    dy: Any,
+    dz: Any,
+    stretch: Any,
+    count: int,
+    out: Any,
+) -> None:
+    half_length = params[b, 18]
+    endless = half_length == math.inf
+    xx, xy, xz = params[b, 9], params[b, 10], params[b, 11]
+    yx, yy, yz = params[b, 12], params[b, 13], params[b, 14]
+    zx, zy, zz = params[b, 15], params[b, 16], params[b, 17]
+    for n in range(count):
+        ux = xx * dx[n] + xy * dy[n] + xz * dz[n]
+        uy = yx * dx[n] + yy * dy[n] + yz * dz[n]
+        uz = zx * dx[n] + zy * dy[n] + zz * dz[n]
+        a = ux * ux + uy * uy
+        inverse = 1.0 / a
+        t = -(lx * ux + ly * uy) * inverse
+        x, y = lx + t * ux, ly + t * uy
+        rest = max(1.0 - (x * x + y * y), 0.0)
+        half = math.sqrt(rest * inverse)
+        # A ray along the axis is inside of the section from end to end, or nowhere.
+        along = math.inf if lx * lx + ly * ly < 1.0 else 0.0
+        t, half = (t if a > 0.0 else 0.0), (half if a > 0.0 else along)
+        clipped = 2.0 * half if endless else _clipped(t - half, t + half, lz, uz, half_length)
+        out[n] = clipped * stretch[n]
+
+
+@numba.njit(inline="always", fastmath=_FAST, error_model="numpy")
+def _slab(p: float, u: float) -> tuple[float, float]:
+    """Where a line is between two faces of the unit box, without branches."""
+    inverse = 1.0 / u
+    near, far = (-1.0 - p) * inverse, (1.0 - p) * inverse
+    low, high = min(near, far), max(near, far)
+    inside = abs(p) < 1.0
+    low = low if u != 0.0 else (-math.inf if inside else math.inf)
+    high = high if u != 0.0 else (math.inf if inside else -math.inf)
+    return low, high
+
+
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _box_chords(
+    params: Any,
+    b: int,
+    lx: float,
+    ly: float,
+    lz: float,
+    dx: Any,
+    dy: Any,
+    dz: Any,
+    stretch: Any,
+    count: int,
+    out: Any,
+) -> None:
+    xx, xy, xz = params[b, 9], params[b, 10], params[b, 11]
+    yx, yy, yz = params[b, 12], params[b, 13], params[b, 14]
+    zx, zy, zz = params[b, 15], params[b, 16], params[b, 17]
+    for n in range(count):
+        ux = xx * dx[n] + xy * dy[n] + xz * dz[n]
+        uy = yx * dx[n] + yy * dy[n] + yz * dz[n]
+        uz = zx * dx[n] + zy * dy[n] + zz * dz[n]
+        x0, x1 = _slab(lx, ux)
+        y0, y1 = _slab(ly, uy)
+        z0, z1 = _slab(lz, uz)
+        out[n] = max(min(min(x1, y1), z1) - max(max(x0, y0), z0), 0.0) * stretch[n]
+
+
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _tube_chords(
+    narrowed: bool,
+    params: Any,
+    b: int,
+    lx: float,
+    ly: float,
+    lz: float,
+    dx: Any,
+    dy: Any,
+    dz: Any,
+    stretch: Any,
+    count: int,
+    out: Any,
+) -> None:
+    """As :func:`shallow`, two steps of Newton's method for every ray; what they do not settle is
+    left to :func:`shallow` and :func:`steep`."""
+    half_length, radius, amplitude = params[b, 18], params[b, 19], params[b, 20]
+    omega, reach, steepest = params[b, 21], params[b, 22], params[b, 23]
+    endless = half_length == math.inf
+    half_amplitude = 0.5 * amplitude
+    farthest = 4.0 / omega
+    straight = 1.0 / radius
+    xx, xy, xz = params[b, 9], params[b, 10], params[b, 11]
+    yx, yy, yz = params[b, 12], params[b, 13], params[b, 14]
+    zx, zy, zz = params[b, 15], params[b, 16], params[b, 17]
+    for n in range(count):
+        ux = xx * dx[n] + xy * dy[n] + xz * dz[n]
+        uy = yx * dx[n] + yy * dy[n] + yz * dz[n]
+        uz = zx * dx[n] + zy * dy[n] + zz * dz[n]
+        flat = ux * ux + uy * uy
+        start = -(lx * ux + ly * uy) / flat
+        x, y, z = lx + start * ux, ly + start * uy, lz + start * uz
+        X = x + radius
+        bent = (amplitude > 0.0) & (abs(z) - 2.5 * (radius + amplitude) * abs(uz) < reach)
+        # Farther from the bulge the phase does not matter.
+        c0, s0 = _cos_sin(omega * min(max(z, -farthest), farthest))
+        near = abs(z) < reach
+        d = half_amplitude * (1.0 + c0) if near else 0.0
+        bulged = 1.0 / (radius + d)
+        thinned = (radius + d) * straight * straight
+        sx = thinned if narrowed else bulged
+        sy = thinned if narrowed else straight
+        u0, v0, du, dv = X * sx - 1.0, y * sy, ux * sx, uy * sy
+        curvature = du * du + dv * dv
+        flatness = 1.0 / curvature
+        t = -(u0 * du + v0 * dv) * flatness
+        u0, v0 = u0 + t * du, v0 + t * dv
+        lowest = u0 * u0 + v0 * v0 - 1.0
+        half = math.sqrt(max(-lowest, 0.0) * flatness)
+        t0, t1 = t - half, t + half
+        # The change of the profile on the way to either end, to first order.
+        phase = omega * uz
+        turn, bend = half_amplitude * phase * s0, 0.5 * half_amplitude * phase * phase * c0
+        u0, u1 = (X + t0 * ux) * sx - 1.0, (X + t1 * ux) * sx - 1.0
+        scale = flatness / half * bulged
+        scale0 = -scale if narrowed else scale * u0
+        scale1 = -scale if narrowed else scale * u1
+        step0 = scale0 * (1.0 + u0) * (turn + bend * t0) * t0
+        step1 = scale1 * (1.0 + u1) * (turn + bend * t1) * t1
+        t0 = t0 + step0 if near else t0
+        t1 = t1 - step1 if near else t1
+        # Written out: the compiler makes no SIMD of a loop inside of a loop.
+        t0, step0 = _newton(
+            narrowed,
+            t0,
+            X,
+            y,
+            z,
+            ux,
+            uy,
+            uz,
+            radius,
+            half_amplitude,
+            omega,
+            reach,
+            c0,
+            s0,
+            curvature,
+        )
+        t1, step1 = _newton(
+            narrowed,
+            t1,
+            X,
+            y,
+            z,
+            ux,
+            uy,
+            uz,
+            radius,
+            half_amplitude,
+            omega,
+            reach,
+            c0,
+            s0,
+            curvature,
+        )
+        t0, step0 = _newton(
+            narrowed,
+            t0,
+            X,
+            y,
+            z,
+            ux,
+            uy,
+            uz,
+            radius,
+            half_amplitude,
+            omega,
+            reach,
+            c0,
+            s0,
+            curvature,
+        )
+        t1, step1 = _newton(
+            narrowed,
+            t1,
+            X,
+            y,
+            z,
+            ux,
+            uy,
+            uz,
+            radius,
+            half_amplitude,
+            omega,
+            reach,
+            c0,
+            s0,
+            curvature,
+        )
+        # Written so that a NaN settles nothing.
+        gentle = abs(uz) <= steepest * stretch[n]
+        deep = lowest <= (-0.02 - 12.0 * half_amplitude * abs(phase) if bent else 0.0)
+        settled = gentle & deep & (step0 * step0 + step1 * step1 <= 2e-10 * half)
+        missed = gentle & (lowest >= (1.0 if bent else 0.0))
+        length = t1 - t0 if endless else _clipped(t0, t1, z, uz, half_length)
+        length = max(length, 0.0) * stretch[n]
+        out[n] = 0.0 if missed else (length if settled else -1.0)
+    for n in range(count):
+        if out[n] >= 0.0:
+            continue
+        inverse = 1.0 / stretch[n]
+        ex, ey, ez = dx[n] * inverse, dy[n] * inverse, dz[n] * inverse
+        ux = xx * ex + xy * ey + xz * ez
+        uy = yx * ex + yy * ey + yz * ez
+        uz = zx * ex + zy * ey + zz * ez
+        if abs(uz) <= steepest:
+            t0, t1 = shallow(narrowed, lx, ly, lz, ux, uy, uz, radius, amplitude, omega, reach)
+            if t1 > t0:
+                t0, t1 = clip(t0, t1, lz, uz, half_length)
+        else:
+            t0, t1 = steep(
+                narrowed, lx, ly, lz, ux, uy, uz, radius, amplitude, omega, reach, half_length
+            )
+        out[n] = t1 - t0 if t1 > t0 else 0.0

@@ -18,6 +18,7 @@ from torchpcct.scene import (
     chord_lengths,
     rotation_matrix,
 )
+from torchpcct.scene.chord_kernels import chords_from, may_meet
 from torchpcct.scene.chords import pack
 from torchpcct.threads import get_num_threads, set_num_threads
 
@@ -209,3 +210,33 @@ def test_same_result_with_one_thread():
     finally:
         set_num_threads(threads)
     assert np.array_equal(many, single)
+
+
+@pytest.mark.parametrize("height", [0.0, 6.0, 120.0, 6000.0])
+@pytest.mark.parametrize("name", SHAPES)
+def test_many_rays_of_one_source_have_the_chords_of_each(name, height):
+    """Rays that hit, miss and graze, shallow and steep, side by side."""
+    rng = np.random.default_rng([len(name), int(height), 1])
+    origin = rays(rng, 1, 626.0, height)[0][0]
+    targets = np.array(PLACE) + rng.uniform(-1, 1, (60, 3)) * (1.5, 1.5, 2.2)
+    d = targets - origin
+    d /= np.hypot(d[:, :1], d[:, 1:2])
+    kinds, params = pack([SHAPES[name]])
+    out = np.full(60, np.nan)
+    rows = [np.ascontiguousarray(d[:, axis]) for axis in range(3)]
+    chords_from(int(kinds[0]), params, 0, *origin, *rows, np.hypot(1.0, d[:, 2]), 60, out)
+    (expected,) = chord_lengths([SHAPES[name]], origin, d)
+    np.testing.assert_allclose(out, expected, atol=2e-10)
+    seen = [may_meet(params, 0, *origin[:2], *ray) for ray in d[:, :2]]
+    assert np.all(seen >= (expected > 0))
+    assert (expected > 0).sum() > 5
+
+
+@pytest.mark.parametrize("shape", [EllipticCylinder(2.0, 3.0), Box((2.0, 2.0, 3.0))])
+def test_rays_along_a_face_of_many_from_one_source(shape):
+    """No climb, at a height inside, on and beyond the face; exactly along the other faces, too."""
+    kinds, params = pack([shape])
+    for z in (-3.5, -3.0, 0.0, 2.9, 3.1):
+        out, one, zero = np.empty(1), np.ones(1), np.zeros(1)
+        chords_from(int(kinds[0]), params, 0, -9.0, 0.0, z, one, zero, zero, one, 1, out)
+        assert out[0] == chord_lengths([shape], (-9.0, 0.0, z), (1.0, 0.0, 0.0))[0, 0]
