@@ -2,8 +2,9 @@
 
 Read :mod:`~recon.api` (one call for everything), then a method: :mod:`recon.analytic` (filtered
 backprojection), :mod:`recon.least_squares` (PWLS; its engine is :mod:`recon.gram`, AᵀWA by FFT),
-:mod:`recon.mbir` (unrolled steps with a learned prior). Each gives :mod:`~recon.solution`. Tools:
-:mod:`~recon.linear_operator`, :mod:`~recon.conjugate_gradient`, :mod:`~recon.filters` of a volume.
+:mod:`recon.mbir` (unrolled steps with a learned prior). All that PWLS and MBIR see of a scan is
+its :mod:`~recon.data_term`; each method gives :mod:`~recon.result`. Tools:
+:mod:`~recon.conjugate_gradient`, :mod:`~recon.filters` of a volume.
 What a method has to beat: :mod:`recon.evaluate`. Comparisons: :mod:`recon.study`.
 """
 

@@ -17,7 +17,7 @@ from recon.least_squares.reconstruct import reconstruct_pwls
 from recon.mbir.reconstruct import reconstruct_mbir
 from recon.metal import metal_warnings
 from recon.names import METHODS, split_method
-from recon.solution import Solution, tested
+from recon.result import Result, tested
 from torchpcct.checks.defects import dead_readings, repair_defects
 from torchpcct.checks.readings import reading_warnings
 from torchpcct.geometry import VolumeGrid
@@ -231,7 +231,7 @@ def reconstruct(
 
 
 def _finished(
-    scan: Scan, grid: VolumeGrid, solution: Solution
+    scan: Scan, grid: VolumeGrid, solution: Result
 ) -> tuple[Tensor, dict[str, Any], list[str]]:
     """The volume in the scan's unit, the report with what the tests of the data say, and all
     warnings."""
@@ -265,7 +265,7 @@ def _fbp(
     progress: Callable[[float], None],
     *,
     kernel: str = "standard",
-) -> Iterator[list[Solution]]:
+) -> Iterator[list[Result]]:
     if not isinstance(kernel, str):
         raise TypeError(
             f"kernel must be one name, got {kernel!r}; recon.analytic.inset.InsetFbp takes "
@@ -275,7 +275,7 @@ def _fbp(
     warnings, notes = [*run.warnings, *sampling_warnings(run.circle)], view_notes(run.circle)
     report = {"method": "fbp", "kernel": kernel, **({"notes": notes} if notes else {})}
     for i, s in enumerate(scans):
-        yield [Solution(run(s)[0][0], report, warnings)]
+        yield [Result(run(s)[0][0], report, warnings)]
         progress((i + 1) / len(scans))
 
 
@@ -290,7 +290,7 @@ def _mbir(
     point: Sequence[float] | None = None,
     vessel_prior: VesselPrior | None = None,
     **options: Any,
-) -> Iterator[list[Solution]]:
+) -> Iterator[list[Result]]:
     """MBIR, with the applications that draw what is known of the object: a vessel's outlines or
     tissues."""
     if vessel or tissues or point is not None or vessel_prior is not None:

@@ -34,9 +34,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from recon.gram.gram import Gram
+from recon.data_term import Quadratic
 from recon.least_squares.inset_problem import InsetProblem
-from recon.mbir.problem import NormalisedProblem
 from recon.mbir.unrolled import Views as NetworkViews
 from recon.mbir.unrolled import first_views
 from torchpcct.acquisition.acquire import acquire
@@ -49,7 +48,7 @@ from train.scenes.drawing import draw_scene
 from train.scenes.rasterise import rasterise
 from train.scenes.scene import SceneConfig
 
-__all__ = ["Batch", "Data", "Sample", "Views", "seed_of", "situation_gram"]
+__all__ = ["Batch", "Data", "Sample", "Views", "seed_of", "situation_term"]
 
 
 def seed_of(*key: int | str) -> int:
@@ -125,7 +124,7 @@ class Batch:
         turned: a volume as the network shall see it, mirrored; unturned: the inverse.
     """
 
-    problem: NormalisedProblem
+    problem: Quadratic
     views: NetworkViews
     truth: Tensor
     edges: Tensor
@@ -141,7 +140,7 @@ class Batch:
         """Number of scenes."""
         return self.truth.shape[0]
 
-    def volumes(self, rows: Tensor) -> tuple[NormalisedProblem, NetworkViews]:
+    def volumes(self, rows: Tensor) -> tuple[Quadratic, NetworkViews]:
         """Problem and views of some of the ``3 · size`` volumes."""
         first, towards, smoothed = (None if v is None else v[rows] for v in self.views)
         assert first is not None
@@ -255,15 +254,16 @@ class Data:
         self._accelerated = self.device.type != "cpu"
         self.views = Views(folder, config, seed)
         self._epoch: tuple[tuple[int, int], list[list[int]]] = (-1, 0), []
-        self._grams: dict[int, tuple[Gram, float]] = {}
+        self._terms: dict[int, Quadratic] = {}
         self._on_device: dict[int, Sample] = {}
 
-    def gram(self, situation: int) -> tuple[Gram, float]:
-        """Gram operator per second of exposure, and 1 HU in mm⁻¹."""
-        if situation not in self._grams:
-            gram, hu = situation_gram(self.config.situations[situation], self.config)
-            self._grams[situation] = gram.to(self.device), hu
-        return self._grams[situation]
+    def term(self, situation: int) -> Quadratic:
+        """The data term of a situation, empty, of a scan of 1 s; its operator is a Gram."""
+        if situation not in self._terms:
+            term = situation_term(self.config.situations[situation], self.config)
+            gram: Any = term.operator
+            self._terms[situation] = replace(term, operator=gram.to(self.device))
+        return self._terms[situation]
 
     def prepare(self, processes: int) -> None:
         """Compute all views beforehand; else they are computed when a scene is first used.
@@ -318,17 +318,18 @@ class Data:
     def _seen(self, number: int, data: Tensor, truth: Tensor, labels: Tensor) -> Sample:
         """The views of a scene as :func:`painted` gives it."""
         c = self.config
-        gram, hu = self.gram(self._situation(number))
+        empty = self.term(self._situation(number))
+        gram: Any = empty.operator
         generator = torch.Generator().manual_seed(seed_of("sample", self.seed, number))
         low, high = (math.log(v) for v in c.exposure_s)
         exposure = math.exp(low + (high - low) * float(torch.rand((), generator=generator)))
         noise = gram.noise((2,), generator=generator) * math.sqrt(exposure)
-        signal = gram.apply(data.to(self.device))[None] * (hu * exposure)
+        signal = gram.apply(data.to(self.device))[None] * (empty.mu_per_hu * exposure)
         b = torch.cat([signal + noise, signal])
         exposures = torch.full((VOLUMES,), exposure, device=self.device)
-        problem = NormalisedProblem.from_statistic(gram, b, exposures, hu, c.voxel_mm)
+        problem = replace(empty, b=b, scale=exposures).in_noise_units()
         found = first_views(problem, bilateral=True)
-        views = torch.stack([*(v for v in found if v is not None), problem.beta], 1)
+        views = torch.stack([*(v for v in found if v is not None), problem.b], 1)
         return Sample(views.to(torch.float16), truth.to(torch.float16), labels, exposure).to(
             self.device
         )
@@ -362,7 +363,7 @@ class Data:
         """
         c = self.config
         numbers = self.numbers(step, batch)
-        gram, hu = self.gram(self._situation(numbers[0]))
+        empty = self.term(self._situation(numbers[0]))
         samples = [self.sample(numbers[i]) for i in indices]
         generators = [
             torch.Generator().manual_seed(seed_of("step", self.seed, step, i)) for i in indices
@@ -377,7 +378,9 @@ class Data:
         truth = torch.stack([s.truth for s in samples]).float()
         labels = torch.stack([s.labels for s in samples])
         exposure = torch.tensor([s.exposure for s in samples], device=self.device).repeat(VOLUMES)
-        problem = NormalisedProblem.with_beta(gram, views[:, 3], exposure, hu, c.voxel_mm)
+        # b was kept in noise units.
+        problem = replace(empty, b=views[:, 3], scale=exposure).in_noise_units()
+        problem = replace(problem, b=views[:, 3])
         signal, around = labels & _SIGNAL > 0, labels & _AROUND > 0
         found = [
             _random_contrasts(signal, around, c, part)
@@ -456,9 +459,8 @@ def _edges(truth: Tensor) -> Tensor:
     return both[0].sum(0) > BODY_HU
 
 
-def situation_gram(situation: Situation, config: DataConfig) -> tuple[Gram, float]:
-    """The Gram operator of the training inset in one situation, per second of exposure, and 1 HU
-    in mm⁻¹."""
+def situation_term(situation: Situation, config: DataConfig) -> Quadratic:
+    """The data term of the training inset in one situation, empty, of a scan of 1 s."""
     scanner = presets.pcct(views=config.views)
     g = scanner.geometry
     scanner = replace(
@@ -470,7 +472,8 @@ def situation_gram(situation: Situation, config: DataConfig) -> tuple[Gram, floa
     grid = VolumeGrid(config.shape, config.voxel_mm, (0.0, situation.y, situation.x))
     clean = acquire(patient, scanner, region=grid)
     problem = InsetProblem(clean, grid, nodes=1)
-    return problem.gram, problem.mu_ref / 1000.0
+    b = torch.zeros(1, *config.shape)
+    return Quadratic(problem.gram, b, torch.ones(1), (config.voxel_mm,) * 3, problem.mu_ref)
 
 
 # -- of a whole batch: masks ``(n, z, y, x)``, random numbers in 0 … 1 ``(n, k)`` ------------------

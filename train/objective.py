@@ -31,9 +31,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from recon.data_term import Quadratic
 from recon.mbir.network import bilateral_prior
 from recon.mbir.priors import Prior
-from recon.mbir.problem import NormalisedProblem
 from recon.mbir.unrolled import DEFAULT_FIDELITY, Views
 from train.config import ObjectiveConfig
 from train.data import Batch, Data
@@ -127,7 +127,7 @@ class Objective:
             views=views,
             prior=network,
         )
-        error = made - batch.truth[scene] / problem.scale_hu.reshape(-1, 1, 1, 1)
+        error = made - batch.truth[scene] / problem.unit_hu.reshape(-1, 1, 1, 1)
         data = (error * problem.apply(error)).mean(dim=(1, 2, 3))
         places = c.edge * batch.edges + c.body * batch.bodies
         if c.flat and progress >= c.flat_from:
@@ -173,10 +173,10 @@ class Objective:
         for step in range(held_out.batches_in_epoch(_AT_ONCE)):
             batch = held_out.batch(step, _AT_ONCE, range(_AT_ONCE))
             problem, views = batch.volumes(torch.arange(batch.size))
-            scale = problem.scale_hu.reshape(-1, 1, 1, 1)
+            scale = problem.unit_hu.reshape(-1, 1, 1, 1)
 
             def volume(
-                prior: Prior | None, problem: NormalisedProblem = problem, views: Views = views
+                prior: Prior | None, problem: Quadratic = problem, views: Views = views
             ) -> Tensor:
                 # The filter has the views that are kept: those of one step.
                 made: Tensor = model(
@@ -195,7 +195,7 @@ class Objective:
             for i in range(batch.size):
                 inside, weights = bodies[i] > 0, batch.contrast[i, -1]
                 errors = [(v[i] - batch.truth[i]).square() for v in (made, simple)]
-                row = {"scale": float(problem.scale_hu[i])}
+                row = {"scale": float(problem.unit_hu[i])}
                 for name, error in zip(("made", "simple"), errors, strict=True):
                     row[f"{name}_inside"] = (
                         float(error[inside].mean()) if inside.any() else math.nan

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from recon.analytic.exact_noise import roi_covariance
 from recon.analytic.inset import InsetFbp
+from recon.data_term import Quadratic
 from recon.evaluate.methods import Method, noise_of
 from recon.evaluate.response import response, statistic_covariance
 from recon.evaluate.task import Facts, Task
@@ -32,7 +33,6 @@ from recon.least_squares.reconstruct import TOLERANCE_HU
 from recon.mbir.mbir import Mbir
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
-from torchpcct.volume import to_hu
 
 __all__ = ["Draws", "Simulated"]
 
@@ -86,9 +86,9 @@ class Draws:
         return self.filtered(self.clean[0])[0], self.filtered(self.clean[1])[0]
 
     @cached_property
-    def clean_statistic(self) -> tuple[Tensor, Tensor]:
-        """The same of AᵀWy at 1 s, ``(z, y, x)``."""
-        return self.problem.statistic(self.clean[0]).b, self.problem.statistic(self.clean[1]).b
+    def clean_terms(self) -> tuple[Quadratic, Quadratic]:
+        """The same of the data term at 1 s."""
+        return self.problem.term(self.clean[0]), self.problem.term(self.clean[1])
 
     def exact_covariances(self, kernels: Sequence[str]) -> dict[str, NDArray[np.float64]]:
         """Of the ROI means of FBP at 1 s, kernel → ``(rois, 2, rois, 2)`` HU²; it falls as 1 /
@@ -116,18 +116,12 @@ class Draws:
     def response(self, network: Mbir, reader: Any, exposure_s: float) -> dict[str, Any]:
         """``adjoints`` ``(2 · rois, z, y, x)`` of MBIR's ROI means, ``mean`` and ``covariance``
         of what they give."""
-        both = [self.noise_free(p, exposure_s).statistic for p in (True, False)]
-        g = response(
-            lambda b: network(self.problem, b, exposure_s),
-            self.problem,
-            reader.weights,
-            both[0],
-            exposure_s,
-        )
+        both = [self.noise_free(p, exposure_s).term for p in (True, False)]
+        g = response(network, self.problem, reader.weights, both[0], exposure_s)
         covariance = statistic_covariance(self.problem, g, exposure_s, self.clean[0])
         rois = len(g) // 2
         mean = np.stack(
-            [torch.einsum("zyx,rzyx->r", b.double(), g).numpy().reshape(rois, 2) for b in both]
+            [torch.einsum("zyx,rzyx->r", t.b[0].double(), g).numpy().reshape(rois, 2) for t in both]
         )
         return {
             "adjoints": g.numpy(),
@@ -240,32 +234,31 @@ class Simulated:
         return self._fbp[self._draws.kernels.index(kernel)]
 
     @cached_property
-    def statistic(self) -> Tensor:
-        """AᵀW y ``(z, y, x)`` with the weights of the exposure."""
+    def term(self) -> Quadratic:
+        """What the readings say, for PWLS and MBIR: a batch of one."""
         if self.k < 0:
-            return self._draws.clean_statistic[0 if self.present else 1] * self.exposure_s
+            return self._draws.clean_terms[0 if self.present else 1].times(self.exposure_s)
         if self._with_signal is not None:
-            present, absent = self._draws.clean_statistic
-            return self._with_signal.statistic - self.exposure_s * (present - absent)
-        return self.problem.statistic(self.scan).b
+            present, absent = self._draws.clean_terms
+            other = self._with_signal.term
+            b = other.b - self.exposure_s * (present.b - absent.b)
+            return replace(other, b=b, energy=None)
+        return self.problem.term(self.scan)
 
     def pwls(self) -> Tensor:
         """HU ``(z, y, x)``, as :func:`recon.reconstruct` gives it: exact projection pairs, its
         prior and tolerance."""
         problem = self.problem
         with torch.no_grad():
-            found = problem.solve_statistic(
-                self.statistic[None], self.exposure_s, problem.prior, tolerance=TOLERANCE_HU
-            )
-        return to_hu(found.x + problem.level, problem.mu_ref)[0]
+            return problem.solve(self.term, problem.prior, tolerance=TOLERANCE_HU)[0][0]
 
     def mbir(self, network: Mbir) -> Tensor:
-        """HU ``(z, y, x)``."""
+        """HU ``(z, y, x)``, as :func:`recon.reconstruct` gives it."""
         with torch.no_grad():
-            found = network.solved(self.problem, self.statistic[None], self.exposure_s)
+            found = network.solved(self.term)
         note = found.notes[0]
         self.drawn, self.warned = note.get("vessel", {}).get("drawn"), bool(note.get("warnings"))
-        return network.in_hu(self.problem, found.u, found.normal)[0]
+        return found.normal.hu(found.u)[0]
 
     def sigma(self, method: Method, smooths: float = 0.0) -> float:
         """Noise in HU of a linear method at this exposure in the largest tissue."""

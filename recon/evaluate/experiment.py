@@ -1,4 +1,9 @@
-"""Tasks × methods × exposures × realisations: the one loop of the instrument."""
+"""Tasks × methods × exposures × realisations: the jobs of the instrument, and what they found.
+
+An evaluation is a list of jobs (:func:`_jobs`), each of which keeps pieces in a folder: what is
+there already is not computed again. They are run here or by an executor
+(:mod:`recon.jobs.execute`); then the pieces are read.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +14,7 @@ import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache, partial
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,7 +24,7 @@ from numpy.typing import NDArray
 
 from recon.evaluate.draws import Draws
 from recon.evaluate.estimates import Known, Record, records_of
-from recon.evaluate.measure import BLOCK, Measurement, Reader, kept_as
+from recon.evaluate.measure import BLOCK, Measurement, Reader, Readings, kept_as
 from recon.evaluate.methods import Method, method_of
 from recon.evaluate.task import Facts, Task
 from recon.evaluate.tasks import read_task
@@ -134,20 +139,23 @@ def evaluate(
                 progress=progress,
                 executor=executor,
             )
-    executor = executor or execute.current()
+    folder, executor = Path(folder), executor or execute.current()
     if executor is not None:
         jobs = [
             job
             for task in todo
-            for job in _jobs(task, run, exposures, n, seed, Path(folder), executor)
+            for job in _sent(task, run, exposures or task.exposures_s, n, seed, folder, executor)
         ]
-        execute.run(jobs, Path(folder), executor, progress)
+        execute.run(jobs, folder, executor, progress)
     records: list[Record] = []
     seen = []
     for task in todo:
-        found, what = _task(
-            task, run, exposures or task.exposures_s, n, seed, Path(folder), progress
-        )
+        bench = _Bench(folder, task, _everyone(task, run), seed)
+        asked = exposures or task.exposures_s
+        # All of them without an executor; with one, those of methods that no other process takes.
+        left = _jobs(bench, list(bench.methods.values()), bench, asked, n, workers=1)
+        execute.run(left, folder, None, progress)
+        found, what = _read(bench, asked, n)
         records += found
         seen.append(what)
     settings = {
@@ -164,10 +172,6 @@ def _listed(what: Any) -> Sequence[Any]:
     return list(what) if isinstance(what, list | tuple | np.ndarray) else [what]
 
 
-def _pairs(draws: Draws, exposure_s: float, k: range) -> list[Any]:
-    return [draws.draw(exposure_s, i) for i in k]
-
-
 def _everyone(task: Task, methods: Sequence[Method]) -> list[Method]:
     """The methods after the task's reference."""
     reference = method_of(task.reference)
@@ -178,24 +182,19 @@ def _everyone(task: Task, methods: Sequence[Method]) -> list[Method]:
     return [reference, *(m for m in methods if m.name != reference.name)]
 
 
-# --- the same as jobs -----------------------------------------------------------------------------
+# --- jobs -----------------------------------------------------------------------------------------
 
 
-def _jobs(
+def _sent(
     task: Task,
     methods: Sequence[Method],
-    exposures: Sequence[float] | None,
+    exposures: Sequence[float],
     n: int,
     seed: int,
     folder: Path,
     executor: Executor,
 ) -> list[Job]:
-    """What :func:`_task` would compute and is not there yet: scans and facts, then every block of
-    realisations.
-
-    A job draws its realisations for several methods: for all of them, if there are jobs enough for
-    all workers.
-    """
+    """The jobs of all methods that other processes can be given."""
     everyone, sent = _everyone(task, methods), []
     for method in everyone:
         try:
@@ -209,15 +208,40 @@ def _jobs(
                 method.name,
                 error,
             )
-    kernels = tuple(k for m in everyone for k in m.kernels)
-    bench = zlib.compress(execute.packed_call(executor, (task, sent, seed, kernels)))
-    store, place = Store(folder / task.name), f"{task.name}/"
-    first = f"{task.name}: facts"
+    bench = _Bench(folder, task, everyone, seed)
+    packed = zlib.compress(execute.packed_call(executor, (task, sent, seed, bench.draws.kernels)))
+    return _jobs(bench, sent, packed, exposures, n, workers=getattr(executor, "workers", 16))
+
+
+def _jobs(
+    bench: _Bench,
+    methods: Sequence[Method],
+    given: _Bench | bytes,
+    exposures: Sequence[float],
+    n: int,
+    workers: int,
+) -> list[Job]:
+    """All that an evaluation of a task computes and that is not there yet: scans and facts, then
+    every block of realisations.
+
+    A job draws its realisations for several methods: for all of them, if there are jobs enough for
+    all workers.
+
+    Args:
+        bench: of the task.
+        methods: of its methods those that are asked for.
+        given: the bench as jobs take it.
+        exposures: in s.
+        n: realisations.
+        workers: that take jobs at once.
+    """
+    task, seed, store = bench.draws.task, bench.draws.seed, bench.draws.store
+    place, first = f"{task.name}/", f"{task.name}: facts"
     jobs, scans = [], {f"{task.name}: scan, signal {s}": s for s in ("present", "absent")}
     if not store.has("facts", f"1 {task.fingerprint}"):
-        jobs += [Job(name, _do, (bench, "scan", signal)) for name, signal in scans.items()]
-        jobs.append(Job(first, _do, (bench, "facts"), (f"{place}facts.npz",), tuple(scans)))
-    wanted = list(dict.fromkeys(m.kernels[0] for m in sent if m.is_fbp))
+        jobs += [Job(name, _do, (given, "scan", signal)) for name, signal in scans.items()]
+        jobs.append(Job(first, _do, (given, "facts"), (f"{place}facts.npz",), tuple(scans)))
+    wanted = list(dict.fromkeys(m.kernels[0] for m in methods if m.is_fbp))
     exact = [
         kernel for kernel in wanted if not store.has(f"exact_{kernel}", f"1 {task.fingerprint}")
     ]
@@ -226,15 +250,11 @@ def _jobs(
             f"{task.name}: exact noise, {', '.join(exact)}",
             tuple(f"{place}exact_{k}.npz" for k in exact),
         )
-        jobs.append(Job(name, _do, (bench, "exact", exact), made, tuple(scans)))
-    blocks = [range(start, min(start + BLOCK, n)) for start in range(0, n, BLOCK)]
-    exposures = exposures or task.exposures_s
-    groups = (
-        min(len(sent), -(-2 * getattr(executor, "workers", 16) // (len(blocks) * len(exposures))))
-        or 1
-    )
+        jobs.append(Job(name, _do, (given, "exact", exact), made, tuple(scans)))
+    blocks = _blocks(n)
+    groups = min(len(methods), -(-2 * workers // (len(blocks) * len(exposures)))) or 1
     for exposure in exposures:
-        for group in (sent[g::groups] for g in range(groups)):
+        for group in (methods[g::groups] for g in range(groups)):
             kept = {m.name: kept_as(m, exposure, task, seed) for m in group}
             known = f"{task.name}: {exposure:g} s, noise-free, {', '.join(kept)}"
             for k in (range(0), *blocks):
@@ -261,7 +281,7 @@ def _jobs(
                     Job(
                         name,
                         _do,
-                        (bench, "block", exposure, asked, k),
+                        (given, "block", exposure, asked, k),
                         (*pieces, f"{place}sigma_*.npz"),
                         (first, known) if k else (first,),
                         seconds=seconds,
@@ -270,6 +290,11 @@ def _jobs(
                     )
                 )
     return jobs
+
+
+def _blocks(n: int) -> list[range]:
+    """Realisations, a piece each."""
+    return [range(start, min(start + BLOCK, n)) for start in range(0, n, BLOCK)]
 
 
 def _parts(method: Method, k: range) -> tuple[str, ...]:
@@ -297,12 +322,19 @@ def _estimate(task: Task, methods: Sequence[Method], n: int) -> tuple[float, flo
 
 
 class _Bench:
-    """What a process needs of a task: its draws, what reads their volumes, and the methods; then
-    the jobs."""
+    """A task with the methods that are measured at it: its draws, what reads their volumes, and
+    what its jobs do."""
 
     def __init__(
-        self, folder: Path, task: Task, methods: Sequence[Method], seed: int, kernels: Sequence[str]
+        self,
+        folder: Path,
+        task: Task,
+        methods: Sequence[Method],
+        seed: int,
+        kernels: Sequence[str] | None = None,
     ) -> None:
+        if kernels is None:
+            kernels = [k for m in methods for k in m.kernels]
         self.draws = Draws(task, Store(folder / task.name), seed, kernels)
         self.methods = {m.name: m for m in methods}
 
@@ -323,11 +355,26 @@ class _Bench:
     def block(self, exposure: float, names: Sequence[str], k: range) -> None:
         """Pieces of methods at an exposure: of a block of realisations, or of none what is
         without noise."""
-        pairs = cache(partial(_pairs, self.draws, exposure, k))
+        pairs = self._pairs(exposure, k)
         for name in names:
-            measurement = Measurement(self.methods[name], self.draws, self.reader, exposure)
+            measurement = self.measurement(name, exposure)
             if k:
                 measurement.block(k, pairs)
+
+    def readings(self, name: str, exposure: float, n: int) -> Readings:
+        """Of a method at an exposure, from its pieces; one that cannot be read is computed."""
+        measurement = self.measurement(name, exposure)
+        for k in _blocks(n):
+            measurement.block(k, self._pairs(exposure, k))
+        return measurement.readings()
+
+    def measurement(self, name: str, exposure: float) -> Measurement:
+        """Of a method at an exposure."""
+        return Measurement(self.methods[name], self.draws, self.reader, exposure)
+
+    def _pairs(self, exposure: float, k: range) -> Callable[[], list[Any]]:
+        """Realisations, drawn once for all methods, if one needs them."""
+        return cache(lambda: [self.draws.draw(exposure, i) for i in k])
 
 
 @lru_cache(maxsize=1)
@@ -335,28 +382,19 @@ def _bench(folder: Path, packed: bytes) -> _Bench:
     return _Bench(folder, *pickle.loads(zlib.decompress(packed)))
 
 
-def _do(folder: Path, packed: bytes, job: str, *given: Any) -> None:
-    getattr(_bench(folder, packed), job)(*given)
+def _do(folder: Path, given: _Bench | bytes, job: str, *args: Any) -> None:
+    bench = given if isinstance(given, _Bench) else _bench(folder, given)
+    getattr(bench, job)(*args)
 
 
-# --- the loop -------------------------------------------------------------------------------------
+# --- what was found -------------------------------------------------------------------------------
 
 
-def _task(
-    task: Task,
-    methods: Sequence[Method],
-    exposures: Sequence[float],
-    n: int,
-    seed: int,
-    folder: Path,
-    progress: Progress | None,
-) -> tuple[list[Record], TaskResult]:
-    everyone = _everyone(task, methods)
-    reference = everyone[0]
-    bench = _Bench(folder, task, everyone, seed, [k for m in everyone for k in m.kernels])
-    if progress is not None:
-        progress(f"{task.name}: scan", 0.0)
+def _read(bench: _Bench, exposures: Sequence[float], n: int) -> tuple[list[Record], TaskResult]:
+    """The figures of a task, from the pieces of its jobs."""
     draws, reader, facts, truth = bench.draws, bench.reader, bench.draws.facts, bench.reader.truth
+    task, everyone = draws.task, list(bench.methods.values())
+    reference = everyone[0]
     true, absent = (
         np.array([float((hu.double() * (b - a)).sum()) for a, b in task.regions.values()])
         for hu in (truth[0] - truth[1], truth[1])
@@ -367,16 +405,7 @@ def _task(
         list(dict.fromkeys(m.kernels[0] for m in everyone if m.is_fbp))
     )
     for exposure in exposures:
-        running = [Measurement(method, draws, reader, exposure) for method in everyone]
-        for start in range(0, n, BLOCK):
-            k = range(start, min(start + BLOCK, n))
-            # Drawn once for all methods, if one needs them.
-            pairs = cache(partial(_pairs, draws, exposure, k))
-            for measurement in running:
-                measurement.block(k, pairs)
-                if progress is not None:
-                    progress(f"{task.name}: {measurement.method.name}, {exposure:g} s", k.stop / n)
-        found = {m.method.name: m.readings() for m in running}
+        found = {m.name: bench.readings(m.name, exposure, n) for m in everyone}
         base = found[reference.name]
         control = Known(at_1_s[reference.kernels[0]] / exposure, base.clean_rois, base.rois)
         for method in everyone:
@@ -470,7 +499,7 @@ def _finished(
 ) -> bool:
     """Whether all pieces of a method are there."""
     store = Store(folder / task.name)
-    blocks = [range(0), *(range(start, min(start + BLOCK, n)) for start in range(0, n, BLOCK))]
+    blocks = [range(0), *_blocks(n)]
     for exposure in task.exposures_s if exposures_s is None else _listed(exposures_s):
         place, key = kept_as(method, float(exposure), task, seed)
         if not all(store.has(f"{place}/{part}", key) for k in blocks for part in _parts(method, k)):

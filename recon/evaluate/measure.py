@@ -380,7 +380,7 @@ def _of(
             said = [getattr(draw, name, None) for draw in pair]
             lists[name].append([math.nan if answer is None else float(answer) for answer in said])
         if adjoints is not None:
-            control.append([functionals(adjoints, draw.statistic) for draw in pair])
+            control.append([functionals(adjoints, draw.term.b[0]) for draw in pair])
         for o in OBSERVERS:
             channels[o].append([reader.responses(v, o) for v in volumes])
         lists["square"].append(reader.square(volumes[0], reader.task.near))

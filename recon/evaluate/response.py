@@ -11,6 +11,7 @@ over a few draws that serve nothing else.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.analytic.exact_noise import line_integral_variance
+from recon.data_term import Quadratic
 from recon.least_squares.inset_problem import InsetProblem
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 
@@ -30,28 +32,28 @@ _SEED = 1 << 40
 
 
 def response(
-    method: Callable[[Tensor], Tensor],
+    method: Callable[[Quadratic], Tensor],
     problem: InsetProblem,
     weights: Tensor,
-    statistic: Tensor,
+    term: Quadratic,
     exposure_s: float,
 ) -> Tensor:
     """g of every functional, HU per unit of b, ``(rows, z, y, x)`` float64.
 
     Args:
-        method: from statistics ``(1, z, y, x)`` to volumes in HU, differentiable.
+        method: from data terms to volumes in HU, differentiable in their b.
         problem: of the scan.
         weights: ``(rows, z, y, x)`` of the functionals of the volume.
-        statistic: ``(z, y, x)`` the noise-free b with the weights of ``exposure_s``.
+        term: of noise-free data at ``exposure_s``, a batch of one.
         exposure_s: in s.
     """
     generator = torch.Generator().manual_seed(_SEED)
-    noise = problem.gram.noise((_DRAWS,), generator=generator).to(statistic) * exposure_s**0.5
-    g = torch.zeros((len(weights), *statistic.shape), dtype=torch.float64)
-    for b in statistic + noise:
+    noise = problem.gram.noise((_DRAWS,), generator=generator).to(term.b) * exposure_s**0.5
+    g = torch.zeros((len(weights), *term.b.shape[1:]), dtype=torch.float64)
+    for b in term.b + noise:
         with torch.enable_grad():
             leaf = b[None].clone().requires_grad_()
-            volume = method(leaf)
+            volume = method(replace(term, b=leaf))
         # One row at a time: a graph for all of them would hold several GB.
         for k, w in enumerate(weights):
             kept = k + 1 < len(weights)

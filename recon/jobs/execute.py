@@ -5,7 +5,7 @@ afterwards the one program that everybody knows reads them and goes on, as if it
 itself before it was interrupted. So what comes out does not depend on where it was computed, and
 whatever dies, nothing finished is lost.
 
-* serial: no executor;
+* serial: no executor, in this process;
 * :class:`Processes`: of this machine (spawned), one job each at a time; a process that dies takes
   its own job alone;
 * :class:`Cluster`: the workers of a Dask scheduler. Who repeats a job of a worker that died is
@@ -622,7 +622,7 @@ def packed_call(executor: Executor | None, value: Any) -> bytes:
 def run(
     jobs: Sequence[Job],
     folder: Path,
-    executor: Executor,
+    executor: Executor | None,
     progress: Progress | None = None,
     finished: Callable[[Job], Any] | None = None,
 ) -> dict[str, Any]:
@@ -631,7 +631,8 @@ def run(
     Args:
         jobs: with what they need before them.
         folder: that they write into, made if need be.
-        executor: any; by one of this module a job whose worker dies is repeated.
+        executor: any; by one of this module a job whose worker dies is repeated. None: in this
+            process, one after another, with their arguments as they are.
         progress: called with a text and the finished fraction.
         finished: called with each job that is done, its files in ``folder``.
 
@@ -652,6 +653,8 @@ def run(
     if not jobs:
         return {}
     folder.mkdir(parents=True, exist_ok=True)
+    if executor is None:
+        return _run_here(jobs, folder, progress, finished)
     with marker(folder) as here:
         of = _Run(
             str(folder.resolve()),
@@ -662,6 +665,24 @@ def run(
             _current_folder(),
         )
         return _run(jobs, folder, executor, of, _Log(executor, jobs), progress, finished)
+
+
+def _run_here(
+    jobs: Sequence[Job],
+    folder: Path,
+    progress: Progress | None,
+    finished: Callable[[Job], Any] | None,
+) -> dict[str, Any]:
+    values = {}
+    for k, job in enumerate(jobs):
+        if progress is not None:
+            progress(job.name, k / len(jobs))
+        values[job.name] = job.function(folder, *job.args)
+        if finished is not None:
+            finished(job)
+    if progress is not None:
+        progress(jobs[-1].name, 1.0)
+    return values
 
 
 def _current_folder() -> str:

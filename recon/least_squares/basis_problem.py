@@ -213,5 +213,5 @@ class BasisProblem:
             gram=self.gram.scaled(dose),
             **options,
         )
-        images = self.whitening.undo(result.x) + self.level.to(lines.dtype).reshape(2, 1, 1, 1)
+        images = self.whitening.undo(result.volume) + self.level.to(lines.dtype).reshape(2, 1, 1, 1)
         return images, {**result.report, "method": "joint-pwls"}

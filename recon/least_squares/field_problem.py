@@ -18,9 +18,9 @@ from torch.nn import functional as F
 
 from recon.analytic.coverage import check_rows
 from recon.analytic.fbp import fbp
-from recon.least_squares.pwls import PwlsOptions, PwlsResult, pwls
+from recon.least_squares.pwls import PwlsOptions, pwls
 from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
-from recon.solution import RESIDUAL_TEST, Solution, tested
+from recon.result import RESIDUAL_TEST, Result, tested
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import Scan
@@ -178,13 +178,13 @@ class FieldProblem:
         prior: QGGMRF,
         options: PwlsOptions,
         advance: Callable[[float], None],
-    ) -> Iterator[Solution]:
+    ) -> Iterator[Result]:
         """PWLS of every scan, slice by slice, from FBP as the first volume; ``advance`` is told
         the finished share."""
         hu = self.mu_ref / 1000.0
         for i, scan in enumerate(scans):
             slices = self.slices(scan)
-            results: list[PwlsResult] = []
+            results: list[Result] = []
             tests: list[ResidualTest] = []
             found: list[str] = []
             for k, (y, w) in enumerate(slices):
@@ -192,7 +192,9 @@ class FieldProblem:
                     pwls(self.projector, y, w, prior, mu_per_hu=hu, start=self.start(y), **options)
                 )
                 if not scan.noise_free:
-                    tests += tested(RESIDUAL_TEST, found, self.residual_test, y, w, results[-1].x)
+                    tests += tested(
+                        RESIDUAL_TEST, found, self.residual_test, y, w, results[-1].volume
+                    )
                 advance((i + (k + 1) / len(slices)) / len(scans))
             report = {**joined([dict(r.report) for r in results]), "work_grid": self.work.shape}
             if report["undetermined_rmsd_hu"] > UNDETERMINED_HU:
@@ -203,7 +205,7 @@ class FieldProblem:
                     f"{in_words(report['undetermined_rmsd_hu'], self.unit, self.mu_ref)} from the "
                     "minimum"
                 )
-            yield Solution(self.hu([r.x for r in results]), report, found, tests)
+            yield Result(self.hu([r.volume for r in results]), report, found, tests)
 
     def residual_test(self, y: Tensor, w: Tensor, x: Tensor) -> ResidualTest:
         """Whether a volume ``work.shape`` in mm⁻¹ explains the readings of one slice."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
@@ -14,39 +14,25 @@ from torch import Tensor
 
 from recon.analytic.coverage import check_rows
 from recon.analytic.inset import require_inside, require_same_surround, static_fbp
+from recon.data_term import Projected, Quadratic
 from recon.gram.gram import Gram
 from recon.least_squares.field_model import FieldModel
 from recon.least_squares.field_problem import is_whole_field
-from recon.least_squares.pwls import PwlsOptions, PwlsResult, data_model, pwls, solve_normal
+from recon.least_squares.memory import require_memory
+from recon.least_squares.pwls import MinimiseOptions, PwlsOptions, data_model, minimise
 from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
 from recon.least_squares.surround import UnknownSurround, length_unit
-from recon.solution import RESIDUAL_TEST, Solution, tested
+from recon.result import RESIDUAL_TEST, Result, tested
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.switches import undisturbed
-from torchpcct.volume import to_hu
 
-__all__ = ["InsetProblem", "Statistic"]
+__all__ = ["InsetProblem"]
 
 if TYPE_CHECKING:
     from torchpcct.metrics.residual_test import ResidualTest
-
-
-@dataclass(frozen=True)
-class Statistic:
-    """All that a scan says about an inset, given the weights W.
-
-    Args:
-        b: AᵀW y, ``grid.shape``, y with the background taken off.
-        energy: yᵀW y.
-        readings: number of readings in the inset's footprint.
-    """
-
-    b: Tensor
-    energy: float
-    readings: int
 
 
 class InsetProblem:
@@ -68,9 +54,6 @@ class InsetProblem:
     counts behind it by a few per cent only.
 
     Attributes:
-        prior: the default one, :data:`recon.least_squares.qggmrf.DEFAULT_PRIOR` in the length unit
-            of the scan (:func:`recon.least_squares.surround.length_unit`): on the paper's scanner
-            0.75 line pairs per mm.
         weights: on ``window``, at 1 s, of line integrals in mm⁻¹ · mm.
         model: of AᵀWA at 1 s, :func:`recon.least_squares.pwls.data_model`.
 
@@ -91,7 +74,6 @@ class InsetProblem:
                 "energy-integrating scan with electronic noise"
             )
         self.grid, self.geometry = grid, scan.geometry
-        self.prior = DEFAULT_PRIOR.stretched(length_unit(scan.geometry), grid.ndim)
         self.outer = scan.window or DetectorWindow.full(scan.geometry)
         check_rows(scan.geometry, grid)
         self.mu_ref, self.unit = scan.linearisation.mu_ref, scan.unit
@@ -150,6 +132,13 @@ class InsetProblem:
         along = DetectorWindow(first, still.columns, still.first_row, still.rows)
         weights = along.take(self._cell_weights).contiguous()
         self.model = Gram(Projector(geometry, grid, still), weights, nodes=self._nodes)
+
+    @property
+    def prior(self) -> QGGMRF:
+        """The default one, :data:`recon.least_squares.qggmrf.DEFAULT_PRIOR` in the length unit of
+        the scan (:func:`recon.least_squares.surround.length_unit`): on the paper's scanner 0.75
+        line pairs per mm."""
+        return DEFAULT_PRIOR.stretched(length_unit(self.geometry), self.grid.ndim)
 
     @property
     def gram(self) -> Gram:
@@ -214,17 +203,55 @@ class InsetProblem:
         return lines - self.window.take(self._background)
 
     @undisturbed
-    def statistic(self, scan: Scan, data: Tensor | None = None) -> Statistic:
-        """What the solvers need of a scan, with the weights of its exposure (noise free: of 1 s).
+    def term(self, scan: Scan, data: Tensor | None = None) -> Quadratic:
+        """What solvers need of a scan, with the weights of its exposure (noise free: of 1 s): a
+        batch of one volume, the FFT model its operator; :meth:`exact` puts projections there.
 
         Args:
             scan: of the family.
             data: its :meth:`data`, where it is at hand already.
         """
         y = self.data(scan) if data is None else data
-        weighted = self.weights * (scan.exposure_s or NOISE_FREE_EXPOSURE_S) * y
-        energy = float((weighted * y).sum((-1, -2), dtype=torch.float64).sum())
-        return Statistic(self.projector.T(weighted), energy, y.numel())
+        exposure = float(scan.exposure_s or NOISE_FREE_EXPOSURE_S)
+        weighted = self.weights * exposure * y
+        energy = (weighted * y).sum((-1, -2), dtype=torch.float64).sum()
+        found = self.term_of(self.projector.T(weighted)[None], exposure)
+        return replace(found, energy=energy[None], readings=self.readings)
+
+    def term_of(self, b: Tensor, exposure_s: float) -> Quadratic:
+        """The data term of b = AᵀW y ``(batch, z, y, x)`` that is known already, W that of the
+        exposure."""
+        return Quadratic(
+            self.model if isinstance(self.model, Gram) else self._projected(1.0),
+            b,
+            torch.full((len(b),), float(exposure_s), dtype=torch.float64),
+            self.grid.spacing,
+            self.mu_ref,
+            self.level,
+        )
+
+    @property
+    def readings(self) -> int:
+        """Readings of positive weight in the inset's footprint."""
+        return int((self.weights > 0).sum())
+
+    def _projected(self, exposure_s: float) -> Projected:
+        weights = self.weights * exposure_s
+        return Projected(self.projector, lambda y: weights * y, self.model.scaled(exposure_s))
+
+    def exact(self, term: Quadratic) -> Quadratic:
+        """The data term with projections for its operator, for scans of one exposure.
+
+        Raises:
+            ValueError: they have several.
+        """
+        exposures = set(term.scale.tolist())
+        if len(exposures) != 1:
+            raise ValueError(
+                f"the scans of one batch must have one exposure, got {sorted(exposures)} s"
+            )
+        (exposure,) = exposures
+        return replace(term, operator=self._projected(exposure), scale=torch.ones(len(term.b)))
 
     @undisturbed
     def residual_test(self, scan: Scan, volume: Tensor, data: Tensor | None = None) -> ResidualTest:
@@ -240,76 +267,29 @@ class InsetProblem:
             raise ValueError("the residual of a noise-free scan is not noise: test a noisy one")
         x = (volume / 1000.0 + 1.0) * self.mu_ref - self.level
         fitted = self.projector(x.to(torch.float32))
-        weights = self.weights * self.exposure([scan]) * torch.exp(-fitted)
+        weights = (
+            self.weights * float(scan.exposure_s or NOISE_FREE_EXPOSURE_S) * torch.exp(-fitted)
+        )
         y = self.data(scan) if data is None else data
         return residual_test(y - fitted, weights, fitted, unknowns=self.grid.voxels)
-
-    @staticmethod
-    def exposure(scans: Sequence[Scan]) -> float:
-        """The one exposure of several scans, in s; 1 for noise-free ones.
-
-        Raises:
-            ValueError: they have several.
-        """
-        exposures = {s.exposure_s or NOISE_FREE_EXPOSURE_S for s in scans}
-        if len(exposures) != 1:
-            raise ValueError(
-                f"the scans of one batch must have one exposure, got {sorted(exposures)} s"
-            )
-        return float(exposures.pop())
-
-    @undisturbed
-    def solve_statistic(
-        self, b: Tensor, exposure_s: float, prior: QGGMRF, tolerance: float
-    ) -> PwlsResult:
-        """PWLS of what :meth:`statistic` gives alone: the volumes of :meth:`solve`, in mm⁻¹ above
-        ``level``.
-
-        Args:
-            b: AᵀW y ``(..., *grid.shape)`` with the weights of the exposure.
-            exposure_s: of the readings.
-            prior, tolerance: as of :func:`recon.least_squares.pwls.pwls`.
-        """
-        weights = self.weights * exposure_s
-
-        def exact(x: Tensor) -> Tensor:
-            return self.projector.T(weights * self.projector(x))
-
-        return solve_normal(
-            b,
-            exact,
-            self.model.scaled(exposure_s),
-            prior,
-            mu_per_hu=self.mu_ref / 1000.0,
-            spacing=self.grid.spacing,
-            tolerance=tolerance,
-        )
 
     @undisturbed
     def solve(
         self,
-        scans: Sequence[Scan],
+        term: Quadratic,
         prior: QGGMRF,
-        data: Sequence[Tensor] | None = None,
-        **options: Unpack[PwlsOptions],
+        memory: int | None = None,
+        **options: Unpack[MinimiseOptions],
     ) -> tuple[Tensor, dict[str, Any]]:
-        """PWLS of several realisations of one exposure: ``(scans, z, y, x)`` HU, and the solver's
-        report.
+        """PWLS of data terms of one exposure: ``(batch, z, y, x)`` HU, and the solver's report.
 
-        ``data`` are :meth:`data` of the scans, where they are at hand already.
+        Args:
+            term: of :meth:`term`, of one scan or several joined.
+            prior, memory, options: as of :func:`recon.least_squares.pwls.pwls`.
         """
-        exposure = self.exposure(scans)
-        lines = [self.data(s) for s in scans] if data is None else list(data)
-        result = pwls(
-            self.projector,
-            torch.stack(lines),
-            self.weights * exposure,
-            prior,
-            mu_per_hu=self.mu_ref / 1000.0,
-            gram=self.model.scaled(exposure),
-            **options,
-        )
-        return to_hu(result.x + self.level, self.mu_ref), dict(result.report)
+        require_memory(self.projector, len(term.b), term.b, memory)
+        found = minimise(self.exact(term), prior, **options)
+        return term.hu(found.volume), dict(found.report)
 
     def solutions(
         self,
@@ -317,10 +297,11 @@ class InsetProblem:
         prior: QGGMRF,
         options: PwlsOptions,
         advance: Callable[[float], None],
-    ) -> Iterator[Solution]:
+    ) -> Iterator[Result]:
         """PWLS of all scans together; ``advance`` is told the finished share of them."""
         data = [self.data(s) for s in scans]
-        found, report = self.solve(scans, prior, data, **options)
+        terms = [self.term(s, y) for s, y in zip(scans, data, strict=True)]
+        found, report = self.solve(Quadratic.joined(terms), prior, **options)
         for scan, lines, values in zip(scans, data, found.to(torch.float32), strict=True):
             said: list[str] = []
             tests = (
@@ -328,5 +309,5 @@ class InsetProblem:
                 if scan.noise_free
                 else tested(RESIDUAL_TEST, said, self.residual_test, scan, values, lines)
             )
-            yield Solution(values, report, said, tests)
+            yield Result(values, report, said, tests)
         advance(1.0)

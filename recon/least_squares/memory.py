@@ -59,13 +59,13 @@ def pwls_bytes(A: Any, batch: int, dtype: torch.dtype, device: torch.device) -> 
     return int(inside + item * (VOLUMES * volume + SINOGRAMS * data))
 
 
-def require_memory(A: Any, y: Tensor, memory: int | None) -> None:
-    """Refuse data ``(..., *A.range_shape)`` whose reconstruction does not fit into ``memory``
-    bytes.
+def require_memory(A: Any, batch: int, like: Tensor, memory: int | None) -> None:
+    """Refuse a reconstruction that does not fit into ``memory`` bytes.
 
     Args:
         A: the exact operator.
-        y: the data.
+        batch: volumes at a time.
+        like: of the dtype and on the device of the data.
         memory: None: what is available.
 
     Raises:
@@ -73,9 +73,8 @@ def require_memory(A: Any, y: Tensor, memory: int | None) -> None:
     """
     if memory is not None:
         whole("memory", memory)
-    batch = y.numel() // max(torch.Size(A.range_shape).numel(), 1)
-    need = pwls_bytes(A, batch, y.dtype, y.device)
-    free = available_bytes(y.device) if memory is None else memory
+    need = pwls_bytes(A, batch, like.dtype, like.device)
+    free = available_bytes(like.device) if memory is None else memory
     if need > free:
         raise ValueError(
             f"PWLS of {batch} volume(s) {tuple(A.domain_shape)} from data {tuple(A.range_shape)} "

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from recon.conjugate_gradient import dot, per_volume
+from recon.data_term import NormalOperator
 from recon.least_squares.qggmrf import BoundPrior
-from recon.linear_operator import NormalOperator
 
 __all__ = ["ModelSolver", "line_search", "mean_share"]
 

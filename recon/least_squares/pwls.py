@@ -24,8 +24,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from typing import Any, TypedDict
 
 import torch
@@ -33,23 +32,24 @@ from torch import Tensor
 
 from recon.analytic.backproject import check_data
 from recon.conjugate_gradient import dot, per_volume
+from recon.data_term import NormalOperator, Projected, Quadratic
 from recon.gram.gram import Gram, check_weights
 from recon.least_squares.field_model import FieldModel, GradientStep
 from recon.least_squares.memory import gram_bytes, require_memory
 from recon.least_squares.model_solver import ModelSolver, line_search
 from recon.least_squares.qggmrf import QGGMRF, BoundPrior
-from recon.linear_operator import NormalOperator
+from recon.result import Result
 from torchpcct.detector_window import footprint
 from torchpcct.validate import checked, number, renamed, whole
 
 __all__ = [
     "Approach",
+    "MinimiseOptions",
     "PwlsOptions",
-    "PwlsResult",
     "data_model",
     "mean_weights",
+    "minimise",
     "pwls",
-    "solve_normal",
     "weigh",
 ]
 
@@ -144,40 +144,20 @@ INSET_SHARE = 0.5
 GRAM_BYTES = 2**29
 
 
-@dataclass(frozen=True)
-class PwlsResult:
-    """A reconstruction and its certificate.
-
-    Args:
-        x: ``(..., *grid.shape)`` mm⁻¹.
-        report: ``exact_pairs`` (A and Aᵀ applied together), ``inner_iterations`` (of the FFT model,
-            one entry per outer iteration), ``gradient`` (norm of the exact gradient of Φ over that
-            of the zero volume, worst volume of the batch, one entry per outer iteration),
-            ``rmsd_hu`` (root mean square distance to the minimum in HU, worst volume, one entry per
-            outer iteration: as the FFT model sees it from the exact gradient and its steps shrink
-            (``ahead``); for a whole field extrapolated from the latest steps, over the voxels that
-            the data determine: ``recon.least_squares.field_model.FieldModel.determined``),
-            ``undetermined`` (share of the other voxels), ``undetermined_rmsd_hu`` (the same
-            estimate over them), ``converged``, ``tolerance_hu``, ``model`` ("gram" or "gradient":
-            who proposed the last step), ``model_misfit`` (of the FFT model on the first step, None
-            without one), ``misfit`` (weighted squared residual per reading of positive weight, one
-            entry per volume: about 1 for the right weights and many more readings than unknowns;
-            from :func:`solve_normal`, unless it is told of the data, None), ``seconds``, and the
-            prior (``strength``, ``lambda``, ``threshold_hu_per_mm``, ``p``, ``q``).
-    """
-
-    x: Tensor
-    report: Mapping[str, Any] = field(default_factory=dict)
-
-
-class PwlsOptions(TypedDict, total=False):
-    """Options of :func:`pwls` that whoever calls it for a scan hands on; each is described
-    there."""
+class MinimiseOptions(TypedDict, total=False):
+    """Options of :func:`minimise` that whoever calls it for a scan hands on; each is described at
+    :func:`pwls`."""
 
     tolerance: float
     max_exact: int
-    memory: int | None
     callback: Callable[[dict[str, Any]], None] | None
+
+
+class PwlsOptions(MinimiseOptions, total=False):
+    """Options of :func:`pwls` that whoever calls it for a scan hands on; each is described
+    there."""
+
+    memory: int | None
 
 
 @checked
@@ -195,7 +175,7 @@ def pwls(
     memory: int | None = None,
     callback: Callable[[dict[str, Any]], None] | None = None,
     hu: float | None = None,
-) -> PwlsResult:
+) -> Result:
     """Minimise ½‖y − A x‖²_W + R(x), in 2-D and 3-D, for an inset or a whole field of view.
 
     Args:
@@ -246,7 +226,7 @@ def pwls(
         >>> A = Projector(geometry, VolumeGrid((16, 16), 1.0))
         >>> lines = A(torch.full(A.domain_shape, 0.02))
         >>> found = pwls(A, lines, torch.full(A.range_shape, 1e4), DEFAULT_PRIOR, tolerance=1.0)
-        >>> found.report["converged"], round(float(found.x.mean()), 3)
+        >>> found.report["converged"], round(float(found.volume.mean()), 3)
         (True, 0.02)
     """
     if hu is not None:
@@ -261,7 +241,7 @@ def pwls(
     mean = mean_weights(weights) if channels else weights
     known, shape = mean > 0, (2, *rays) if channels else rays
     check_data("y", y, shape)
-    require_memory(A, y, memory)
+    require_memory(A, y.numel() // max(torch.Size(rays).numel(), 1), y, memory)
     y = torch.where(known, y, torch.zeros((), dtype=y.dtype, device=y.device))
     w = weights.to(y.dtype)
 
@@ -274,28 +254,32 @@ def pwls(
             "y holds NaN or Inf in readings of positive weight: give these readings the weight 0"
         )
     model = data_model(A, mean) if gram is None else gram
-
-    def exact(x: Tensor) -> Tensor:
-        out: Tensor = A.T(weighed(A(x)))
-        return out
-
     energy, readings = dot(weighted, y, len(shape)), int(known.sum()) * (1 + channels)
+    lead = y.shape[: -len(shape)]
     del y
-    result = solve_normal(
-        A.T(weighted),
-        exact,
-        model,
-        prior,
-        mu_per_hu=mu_per_hu,
-        spacing=A.grid.spacing,
-        channels=channels,
-        start=start,
-        tolerance=tolerance,
-        max_exact=max_exact,
-        callback=callback,
-        data=(energy.reshape(-1), readings),
+    b = A.T(weighted)
+    volume = b.shape[len(lead) :]
+    term = Quadratic(
+        Projected(A, weighed, model),
+        b.reshape(-1, *volume),
+        torch.ones(lead.numel()),
+        A.grid.spacing,
+        1000.0 * mu_per_hu,
+        energy=energy.reshape(-1),
+        readings=readings,
     )
-    return PwlsResult(result.x, {**result.report, "seconds": time.perf_counter() - started})
+    if start is not None:
+        if tuple(start.shape[start.dim() - len(volume) :]) != tuple(volume):
+            raise ValueError(
+                f"start must have shape (..., {', '.join(map(str, volume))}), got "
+                f"{tuple(start.shape)}"
+            )
+        start = start.expand(*lead, *volume).reshape(-1, *volume)
+    found = minimise(
+        term, prior, start=start, tolerance=tolerance, max_exact=max_exact, callback=callback
+    )
+    seconds = time.perf_counter() - started
+    return Result(found.volume.reshape(*lead, *volume), {**found.report, "seconds": seconds})
 
 
 def weigh(information: Tensor, y: Tensor, axes: int) -> Tensor:
@@ -357,53 +341,61 @@ def data_model(A: Any, weights: Tensor, nodes: int = 9) -> Gram | FieldModel:
 
 
 @checked
-def solve_normal(
-    b: Tensor,
-    exact: Callable[[Tensor], Tensor],
-    gram: Any,
+def minimise(
+    term: Quadratic,
     prior: QGGMRF | BoundPrior,
     *,
-    mu_per_hu: float,
-    spacing: tuple[float, ...],
-    channels: bool = False,
     start: Tensor | None = None,
     tolerance: float = 0.2,
     max_exact: int = 200,
     callback: Callable[[dict[str, Any]], None] | None = None,
-    data: tuple[Tensor, int] | None = None,
-) -> PwlsResult:
-    """The same from the sufficient statistic b = AᵀW y: minimise ½ xᵀHx − bᵀx + R(x).
+) -> Result:
+    """The volumes that minimise a data term and a prior, ½ xᵀHx − bᵀx + R(x), in mm⁻¹.
 
     Args:
-        b: ``(..., [channels,] *grid.shape)``.
-        exact: x ↦ H x = AᵀWA x; ``gram.apply`` itself solves the model's problem.
-        gram: the model of H: ``apply(x)``, ``periodic_spectrum()`` and, for a :class:`QGGMRF`,
-            ``information(mu_per_hu, frequency)``; or a
-            :class:`recon.least_squares.field_model.FieldModel`.
-        spacing: voxel size per axis in mm.
-        channels: whether the volumes have an axis of channels, which the prior joins and ``gram``
-            treats alike.
-        data: yᵀW y of each volume, ``(batch,)``, and the number of readings of positive weight, for
-            ``misfit``.
-        prior, mu_per_hu, start, tolerance, max_exact, callback: see :func:`pwls`.
+        term: in mm⁻¹, ``(batch, [channels,] *grid.shape)``. Where its operator is
+            :class:`recon.data_term.Projected`, the model of that proposes the steps, a
+            :class:`recon.gram.gram.Gram` or :class:`recon.least_squares.field_model.FieldModel`;
+            any other operator proposes them by itself. An axis of channels is joined by the prior;
+            the model treats them alike.
+        prior, tolerance, max_exact, callback: see :func:`pwls`.
+        start: first volumes, as ``term.b``, default 0.
+
+    Returns:
+        The volumes, as ``term.b``, and the report: ``exact_pairs`` (A and Aᵀ applied together),
+            ``inner_iterations`` (of the FFT model, one entry per outer iteration), ``gradient``
+            (norm of the exact gradient of Φ over that of the zero volume, worst volume of the
+            batch, one entry per outer iteration), ``rmsd_hu`` (root mean square distance to the
+            minimum in HU, worst volume, one entry per outer iteration: as the FFT model sees it
+            from the exact gradient and its steps shrink (``ahead``); for a whole field extrapolated
+            from the latest steps, over the voxels that the data determine:
+            ``recon.least_squares.field_model.FieldModel.determined``), ``undetermined`` (share of
+            the other voxels), ``undetermined_rmsd_hu`` (the same estimate over them),
+            ``converged``, ``tolerance_hu``, ``model`` ("gram" or "gradient": who proposed the last
+            step), ``model_misfit`` (of the FFT model on the first step, None without one),
+            ``misfit`` (weighted squared residual per reading of positive weight, one entry per
+            volume: about 1 for the right weights and many more readings than unknowns; None where
+            the data term does not know its readings), ``seconds``, and the prior (``strength``,
+            ``lambda``, ``threshold_hu_per_mm``, ``p``, ``q``).
     """
     started = time.perf_counter()
-    axes = len(spacing) + channels
-    shape = b.shape[-axes:]
+    b, spacing, mu_per_hu = term.b, term.spacing, term.mu_per_hu
+    exact, shape = term.apply, b.shape[1:]
+    axes = len(shape)
+    gram: Any = getattr(term.operator, "model", term.operator)
     number("tolerance", tolerance, positive=True, unit="HU")
     whole("max_exact", max_exact)
-    if start is not None and tuple(start.shape[-axes:]) != tuple(shape):
-        raise ValueError(
-            f"start must have shape (..., {', '.join(map(str, shape))}), got {tuple(start.shape)}"
-        )
+    if start is not None and start.shape != b.shape:
+        raise ValueError(f"start must have shape {tuple(b.shape)}, got {tuple(start.shape)}")
     if isinstance(prior, QGGMRF):
         bound = prior.bind(
-            gram.information(mu_per_hu, prior.frequency), spacing, mu_per_hu, channels
+            gram.information(mu_per_hu, prior.frequency),
+            spacing,
+            mu_per_hu,
+            channels=axes > len(spacing),
         )
     else:
         bound = prior
-    lead = b.shape[:-axes]
-    b = b.reshape(-1, *shape)
     proposer: ModelSolver | GradientStep
     if isinstance(gram, FieldModel):
         proposer = GradientStep(gram.nodes, bound, b, gram.scale)
@@ -418,7 +410,7 @@ def solve_normal(
     else:
         if not torch.isfinite(start).all():
             raise ValueError("start holds NaN or Inf")
-        x = start.to(b).expand(*lead, *shape).reshape(b.shape).clone()
+        x = start.to(b).clone()
         data_gradient = exact(x) - b
         pairs += 1
     far = bool((dot(data_gradient, data_gradient, axes).sqrt() > FAR_START * reference).any())
@@ -503,7 +495,9 @@ def solve_normal(
             tolerance,
         )
     change = 0.5 * dot(x, data_gradient - b, axes)  # ½ xᵀHx − bᵀx
-    misfits = None if data is None else ((data[0] + 2 * change).clamp_min(0) / data[1]).tolist()
+    misfits = None
+    if term.energy is not None:
+        misfits = ((term.energy + 2 * change).clamp_min(0) / term.readings).tolist()
     report = {
         "method": "pwls",
         "exact_pairs": pairs,
@@ -524,7 +518,7 @@ def solve_normal(
         "q": bound.q,
         "seconds": time.perf_counter() - started,
     }
-    return PwlsResult(x.reshape(*lead, *shape), report)
+    return Result(x, report)
 
 
 def _misfit(gram: NormalOperator, step: Tensor, curved: Tensor, axes: int) -> float:

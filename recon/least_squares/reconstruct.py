@@ -10,7 +10,7 @@ from recon.least_squares.field_problem import FieldProblem, is_whole_field
 from recon.least_squares.inset_problem import InsetProblem
 from recon.least_squares.pwls import PwlsOptions
 from recon.least_squares.qggmrf import QGGMRF
-from recon.solution import Solution
+from recon.result import Result
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.volume import in_words
@@ -31,7 +31,7 @@ def reconstruct_pwls(
     problem: InsetProblem | FieldProblem | None = None,
     batch: int = 1,
     **options: Unpack[PwlsOptions],
-) -> Iterator[list[Solution]]:
+) -> Iterator[list[Result]]:
     """PWLS with a q-GGMRF prior, to convergence: of an inset, or of a whole field of view (every
     scan of a parallel or fan beam, slice by slice, from FBP as the first volume).
 

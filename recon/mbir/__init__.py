@@ -2,7 +2,7 @@
 
 Read :mod:`~recon.mbir.reconstruct` (from a scan to HU; whole fields of any scanner:
 :mod:`~recon.mbir.field`), then :mod:`~recon.mbir.mbir` (from AᵀW y to HU, with the shipped
-weights), :mod:`~recon.mbir.problem` (the data in noise units), :mod:`~recon.mbir.unrolled` (data
+weights), :mod:`recon.data_term` (the data, in noise units), :mod:`~recon.mbir.unrolled` (data
 steps and network in turn) and :mod:`~recon.mbir.network` (the learned prior).
 :mod:`~recon.mbir.priors` says what may stand in that network's place: filters, denoisers, a network
 of a user's own.

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -34,17 +34,17 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from recon.data_term import Quadratic
 from recon.gram.gram import REFERENCE_FREQUENCY
 from recon.least_squares.field_model import FieldModel
 from recon.least_squares.field_problem import FieldProblem, field_prior
 from recon.least_squares.memory import require_memory
 from recon.least_squares.pwls import pwls
-from recon.mbir.mbir import Mbir, average_onto
+from recon.mbir.mbir import Mbir, Reconstructed, average_onto
 from recon.mbir.network import REFERENCE_SCALE_HU
 from recon.mbir.priors import Prior, same_kind
-from recon.mbir.problem import NormalisedProblem
-from recon.mbir.unrolled import bound, low_residual
-from recon.solution import RESIDUAL_TEST, Solution, tested
+from recon.mbir.unrolled import bound
+from recon.result import RESIDUAL_TEST, tested
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.volume import to_hu
@@ -52,7 +52,7 @@ from torchpcct.volume import to_hu
 if TYPE_CHECKING:
     from torchpcct.metrics.residual_test import ResidualTest  # loads scipy.stats
 
-__all__ = ["FieldGram", "blockwise", "field_solutions", "trained_grid"]
+__all__ = ["Field", "FieldGram", "FieldScan", "blockwise", "trained_grid"]
 
 VOXELS_PER_CELL = (0.7, 1.5)
 """Voxel over detector cell at the axis: the training has 0.2 mm voxels on cells of 0.2 mm × 0.29
@@ -75,7 +75,7 @@ SURROUND_PAIRS = 60
 
 
 class FieldGram:
-    """S AᵀWA S of a whole field, in the form that :class:`recon.mbir.problem.NormalisedProblem`
+    """S AᵀWA S of a whole field, in the form that :class:`recon.data_term.Quadratic`
     asks for.
 
     Args:
@@ -128,7 +128,7 @@ class FieldGram:
 
     def information(self, mu_per_hu: float, frequency: float = REFERENCE_FREQUENCY) -> float:
         """So that the noise scale of the middle is right, see
-        :class:`recon.mbir.problem.NormalisedProblem`."""
+        :class:`recon.data_term.Quadratic`."""
         n = self._model.grid.ndim
         spacing = (self._voxel_mm,) * n
         return self._model.information(mu_per_hu, frequency, spacing) * self._voxel_mm ** (n - 3)
@@ -246,58 +246,150 @@ def _fade(part: slice, n: int, halo: int) -> Tensor:
     return torch.minimum(low, high).clamp(1e-6, 1.0)
 
 
-def field_solutions(
-    scans: Sequence[Scan], grid: VolumeGrid, network: Mbir, progress: Callable[[float], None]
-) -> Iterator[list[Solution]]:
-    """Unrolled MBIR of whole fields, see :func:`recon.mbir.reconstruct.reconstruct_mbir`.
+class Field:
+    """Scans of one geometry on one grid of a whole field, for MBIR.
 
     Args:
-        scans: without a known surround, of one geometry.
+        scan: without a known surround.
         grid: ``(z, y, x)``; of a parallel or fan beam ``(y, x)`` or ``(slices, y, x)``.
-        network: with its weights and fidelity.
-        progress: called with the finished fraction.
-
-    Yields:
-        Volumes in HU; the report also holds ``noise_scale_hu`` (10 and 90 % of the voxels),
-        ``voxel_mm`` (of the grid that was worked on).
+        network: with its weights.
 
     Raises:
-        ValueError: see :class:`recon.least_squares.field_problem.FieldProblem`; too little memory;
-            voxels finer than what the detector resolves.
+        ValueError: see :class:`recon.least_squares.field_problem.FieldProblem`; voxels finer than
+            what the detector resolves.
     """
-    flat = len(scans[0].geometry.shape) == 2
-    asked = grid.slice if flat and grid.ndim == 3 else grid
-    work = trained_grid(asked, scans[0].geometry)
-    fine, cell = grid.spacing[-1], work.spacing[-1]
-    if cell > 1.01 * fine:
-        raise ValueError(
-            f"voxels of {fine:g} mm are finer than what the network was trained for on this "
-            "detector, whose cells have "
-            f"{cell:g} mm at the axis: ask for voxels of {cell:g} mm or more and resample the "
-            "result, or use "
-            'method="pwls"'
+
+    def __init__(self, scan: Scan, grid: VolumeGrid, network: Mbir) -> None:
+        flat = len(scan.geometry.shape) == 2
+        self._asked = grid.slice if flat and grid.ndim == 3 else grid
+        self._work = trained_grid(self._asked, scan.geometry)
+        self.voxel_mm = network.voxel_mm
+        fine, self.cell_mm = grid.spacing[-1], self._work.spacing[-1]
+        if self.cell_mm > 1.01 * fine:
+            raise ValueError(
+                f"voxels of {fine:g} mm are finer than what the network was trained for on this "
+                f"detector, whose cells have {self.cell_mm:g} mm at the axis: ask for voxels of "
+                f'{self.cell_mm:g} mm or more and resample the result, or use method="pwls"'
+            )
+        full = self._work
+        if self._asked is not grid:
+            full = VolumeGrid(
+                (grid.shape[0], *self._work.shape),
+                (grid.spacing[0], *self._work.spacing),
+                (grid.center[0], *self._work.center),
+            )
+        self.problem = FieldProblem(scan, full)
+        self.warnings = self.problem.warnings
+
+    def scans(self, scans: Sequence[Scan]) -> FieldScan:
+        """What is asked of one scan."""
+        (scan,) = scans
+        return FieldScan(self, scan)
+
+    def onto_grid(self, hu: Tensor) -> Tensor:
+        """A volume of the grid that is worked on, on the one that was asked for."""
+        return hu if self._work is self._asked else _onto(hu, self._work, self._asked)
+
+
+class FieldScan:
+    """What :func:`recon.mbir.reconstruct.reconstruct_mbir` asks of a scan of a whole field; see
+    :class:`recon.mbir.inset.InsetScans`, which says the same of scans of an inset.
+
+    Args:
+        field: of the scan.
+        scan: the scan.
+
+    Raises:
+        ValueError: too little memory.
+    """
+
+    def __init__(self, field: Field, scan: Scan) -> None:
+        self._field, self._problem = field, field.problem
+        self._slices = self._problem.slices(scan)
+        A = self._problem.projector
+        require_memory(A, 1, self._slices[0][0], None)
+        self._gram = FieldGram(self._problem, [w for _, w in self._slices], field.voxel_mm)
+        self._around = _surround(self._problem, self._slices)
+        rest = [y - A(x) for (y, _), x in zip(self._slices, self._around, strict=True)]
+        weighed = [w * v for (_, w), v in zip(self._slices, rest, strict=True)]
+        energy = sum((w * v).sum(dtype=torch.float64) for w, v in zip(weighed, rest, strict=True))
+        b = self._gram.ratio * self._stacked([A.T(v) for v in weighed])
+        self.term = Quadratic(
+            self._gram,
+            b[None],
+            torch.ones(1),
+            (field.voxel_mm,) * 3,
+            self._problem.mu_ref,
+            energy=torch.as_tensor(energy)[None],
+            readings=sum(int((w > 0).sum()) for _, w in self._slices),
         )
-    full = work
-    if asked is not grid:
-        full = VolumeGrid(
-            (grid.shape[0], *work.shape),
-            (grid.spacing[0], *work.spacing),
-            (grid.center[0], *work.center),
+
+    def _stacked(self, volumes: Sequence[Tensor]) -> Tensor:
+        """``(z, y, x)`` of the volumes of all slices."""
+        return torch.stack(list(volumes)) if self._problem.plane else volumes[0]
+
+    def solved(self, network: Mbir) -> Reconstructed:
+        """The volume in noise units, whose scale changes over the field."""
+        normal = network.normal(self.term)
+        # Its noise is known on average over directions only: along a starved one, noise would pass
+        # for structure, so nothing is put back.
+        prior = bound(network.prior, normal, normal.spectrum())
+        u = network.with_prior(partial(blockwise, prior, self._scales(normal))).solution(
+            normal, restore=False, solves=SOLVES
         )
-    problem = FieldProblem(scans[0], full)
-    for i, scan in enumerate(scans):
-        slices = problem.slices(scan)
-        require_memory(problem.projector, slices[0][0], None)
-        found, report, warnings = _one(problem, slices, network)
-        tests: list[ResidualTest] = []
-        if not scan.noise_free:
-            for (y, w), x in zip(slices, found, strict=True):
-                tests += tested(RESIDUAL_TEST, warnings, problem.residual_test, y, w, x)
-        hu = problem.hu(found)
-        if work is not asked:
-            hu = _onto(hu, work, asked)
-        yield [Solution(hu, {**report, "voxel_mm": cell}, [*problem.warnings, *warnings], tests)]
-        progress((i + 1) / len(scans))
+        return Reconstructed(normal, u, [{}], [False])
+
+    def _scales(self, normal: Quadratic) -> Tensor:
+        """Noise scale of each voxel, ``(z, y, x)`` HU."""
+        return normal.unit_hu * self._gram.ratio
+
+    def whole(self, normal: Quadratic) -> Quadratic:
+        """The data term before the edges were taken off."""
+        around = self._stacked(self._around)[None]
+        return normal.less(-around / (self._scales(normal) * normal.mu_per_hu))
+
+    def _mm(self, solved: Reconstructed) -> list[Tensor]:
+        """Of each slice in mm⁻¹."""
+        normal, u = solved.normal, solved.u
+        rest = (u[0] * self._scales(normal)) * normal.mu_per_hu
+        parts = rest if self._problem.plane else [rest]
+        return [x + d for x, d in zip(self._around, parts, strict=True)]
+
+    def volumes(self, solved: Reconstructed) -> Tensor:
+        """HU ``(1, *grid.shape)`` on the grid that is worked on."""
+        return self._problem.hu(self._mm(solved))[None]
+
+    def noise_scale_hu(self, k: int, normal: Quadratic) -> tuple[float, float]:
+        """10 and 90 % of the voxels."""
+        seen = self._scales(normal)[self._gram.determined]
+        seen = seen[:: max(1, seen.numel() // 10**6)]
+        low, high = (float(q) for q in torch.quantile(seen, seen.new_tensor([0.1, 0.9])))
+        return low, high
+
+    def peak_hu(self, k: int, solved: Reconstructed) -> float:
+        """The largest value where the data determine any."""
+        found = self._stacked(self._mm(solved))[self._gram.determined]
+        return float(to_hu(found.max(), self._problem.mu_ref))
+
+    def doubts(self, network: Mbir, scales: tuple[float, float]) -> list[str]:
+        """What the network was not trained for."""
+        strange = []
+        if self._problem.plane and len(self._slices) == 1:
+            strange.append("a single slice, without neighbours along z")
+        if self._problem.unit != "HU":
+            strange.append(f"values in {self._problem.unit}, not a patient in HU")
+        if network.noisier_or_quieter(scales):
+            strange.append("another noise than that of its scans")
+        if not strange:
+            return []
+        return [f'the network was not trained for this ({"; ".join(strange)}): use method="pwls"']
+
+    def tests(self, k: int, solved: Reconstructed, failed: list[str]) -> list[ResidualTest]:
+        """Of what is left of each slice."""
+        found: list[ResidualTest] = []
+        for (y, w), x in zip(self._slices, self._mm(solved), strict=True):
+            found += tested(RESIDUAL_TEST, failed, self._problem.residual_test, y, w, x)
+        return found
 
 
 def _onto(hu: Tensor, source: VolumeGrid, target: VolumeGrid) -> Tensor:
@@ -308,66 +400,6 @@ def _onto(hu: Tensor, source: VolumeGrid, target: VolumeGrid) -> Tensor:
         VolumeGrid((1, *g.shape), (1.0, *g.spacing), (0.0, *g.center)) for g in (source, target)
     )
     return average_onto(hu.unsqueeze(-3), source3, target3).squeeze(-3)
-
-
-@torch.no_grad()
-def _one(
-    problem: FieldProblem, slices: Sequence[tuple[Tensor, Tensor]], network: Mbir
-) -> tuple[list[Tensor], dict[str, Any], list[str]]:
-    """The volume of each slice in mm⁻¹ (of a cone beam one), the report, and warnings."""
-    A, model, hu = problem.projector, network.model, problem.mu_ref / 1000.0
-    gram = FieldGram(problem, [w for _, w in slices], network.voxel_mm)
-    around = _surround(problem, slices)
-    projected = [A.T(w * (y - A(x))) for (y, w), x in zip(slices, around, strict=True)]
-    b = gram.ratio * _stacked(problem, projected)
-    normal = NormalisedProblem.from_statistic(gram, b[None], torch.ones(1), hu, network.voxel_mm)
-    scales = normal.scale_hu * gram.ratio
-    # Its noise is known on average over directions only: along a starved one, noise would pass for
-    # structure.
-    prior = bound(network.parts.get("prior", model.network), normal, normal.spectrum())
-    u = network.with_prior(partial(blockwise, prior, scales)).solution(
-        normal, restore=False, solves=SOLVES
-    )
-    left = normal.beta - normal.apply(u)
-    whole = normal.beta + normal.apply(_stacked(problem, around)[None] / (scales * hu))
-    rest = (u[0] * scales) * hu
-    found = [x + d for x, d in zip(around, rest if problem.plane else [rest], strict=True)]
-    squares = [
-        (w * (y - A(x)).square()).sum(dtype=torch.float64)
-        for (y, w), x in zip(slices, found, strict=True)
-    ]
-    readings = sum(int((w > 0).sum()) for _, w in slices)
-    seen = scales[gram.determined]
-    seen = seen[:: max(1, seen.numel() // 10**6)]
-    low, high = (float(q) for q in torch.quantile(seen, seen.new_tensor([0.1, 0.9])))
-    peak = float(to_hu(_stacked(problem, found)[gram.determined].max(), problem.mu_ref))
-    warnings = network.check((low, high), peak, problem.unit, problem.mu_ref)
-    strange = []
-    if problem.plane and len(slices) == 1:
-        strange.append("a single slice, without neighbours along z")
-    if problem.unit != "HU":
-        strange.append(f"values in {problem.unit}, not a patient in HU")
-    if network.noisier_or_quieter((low, high)):
-        strange.append("another noise than that of its scans")
-    if strange:
-        warnings.insert(
-            0, f'the network was not trained for this ({"; ".join(strange)}): use method="pwls"'
-        )
-    report = {
-        "method": "mbir",
-        "iterations": model.steps,
-        "fidelity": network.fidelity,
-        "residual": float(low_residual(replace(normal, beta=whole), left, network.fidelity)),
-        "chi2": float(torch.stack(squares).sum()) / max(readings, 1),
-        "noise_scale_hu": (low, high),
-        **network.made_with,
-    }
-    return found, report, warnings
-
-
-def _stacked(problem: FieldProblem, volumes: Sequence[Tensor]) -> Tensor:
-    """``(z, y, x)`` of the volumes of all slices."""
-    return torch.stack(list(volumes)) if problem.plane else volumes[0]
 
 
 def _surround(problem: FieldProblem, slices: Sequence[tuple[Tensor, Tensor]]) -> list[Tensor]:
@@ -394,5 +426,5 @@ def _surround(problem: FieldProblem, slices: Sequence[tuple[Tensor, Tensor]]) ->
             tolerance=SURROUND_HU,
             max_exact=SURROUND_PAIRS,
         )
-        found.append(result.x)
+        found.append(result.volume)
     return found

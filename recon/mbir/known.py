@@ -3,7 +3,7 @@
 
 With T an image of what is known, drawn from the scan's own data,
 
-    u = T + MBIR(β − H T),
+    u = T + MBIR(b − H T),
 
 so whatever T lacks comes from the data as ever, beside an edge that is no longer there to bleed
 into it. Nothing in :mod:`recon.mbir` says what T shows: :mod:`recon.vessel.known` draws a
@@ -18,7 +18,7 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
-from recon.least_squares.inset_problem import InsetProblem
+from recon.data_term import Quadratic
 
 __all__ = ["Drawn", "Known"]
 
@@ -70,13 +70,12 @@ class Known(Protocol):
         """See the class."""
         ...
 
-    def drawn(self, problem: InsetProblem, b: Tensor, exposure_s: float, fidelity: float) -> Drawn:
+    def drawn(self, term: Quadratic, fidelity: float) -> Drawn:
         """What is drawn of one scan.
 
         Args:
-            problem: of the scan.
-            b: its AᵀW y, ``(z, y, x)``.
-            exposure_s: of b, s.
+            term: of the scan, in mm⁻¹, a batch of one; its operator is a
+                :class:`recon.gram.gram.Gram`.
             fidelity: of the reconstruction, 0 (viewing) … 1 (measuring).
         """
         ...

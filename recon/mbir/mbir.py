@@ -22,16 +22,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from recon.least_squares.inset_problem import InsetProblem
+from recon.data_term import Quadratic
 from recon.mbir.known import Drawn, Known
 from recon.mbir.network import Network
 from recon.mbir.priors import Prior, name_of, network_of, prior_of
-from recon.mbir.problem import NormalisedProblem
 from recon.mbir.unrolled import DEFAULT_FIDELITY, Unrolled, fidelity_frequency
 from recon.mbir.weights_io import digest, read_tensors
 from torchpcct.geometry import VolumeGrid
 from torchpcct.switches import undisturbed
-from torchpcct.volume import from_hu, in_words, to_hu
+from torchpcct.volume import in_words
 
 __all__ = ["Mbir", "Reconstructed", "average_onto", "overlap", "working_grid"]
 
@@ -55,7 +54,7 @@ class Reconstructed:
         drawn: for each volume, whether something known was drawn (:mod:`recon.mbir.known`).
     """
 
-    normal: NormalisedProblem
+    normal: Quadratic
     u: Tensor
     notes: list[dict[str, Any]]
     drawn: list[bool]
@@ -145,9 +144,15 @@ class Mbir:
         return cls(model, fidelity)
 
     @property
+    def prior(self) -> Prior:
+        """What stands between the data steps."""
+        prior: Prior = self.parts.get("prior", self.model.network)
+        return prior
+
+    @property
     def prior_name(self) -> str:
         """Of what stands between the data steps."""
-        return name_of(self.parts.get("prior", self.model.network))
+        return name_of(self.prior)
 
     @property
     def made_with(self) -> dict[str, str]:
@@ -164,83 +169,74 @@ class Mbir:
         training."""
         return digest(self.model.state_dict())
 
-    def problem(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> NormalisedProblem:
-        """The normalised problem of ``b`` ``(batch, z, y, x)``, AᵀW y with the weights of the
-        exposure."""
-        spacing = problem.grid.spacing
-        if max(abs(s / self.voxel_mm - 1.0) for s in spacing) > 0.01:
-            raise ValueError(
-                f"the network works on cubic voxels of {self.voxel_mm:g} mm, got {spacing}: make "
-                "the problem on "
-                "recon.mbir.mbir.working_grid and average the result onto the grid"
-            )
-        exposure = torch.full((b.shape[0],), float(exposure_s))
-        made = NormalisedProblem.from_statistic(
-            problem.gram, b, exposure, problem.mu_ref / 1000.0, self.voxel_mm
-        )
-        level = torch.tensor(problem.level, dtype=torch.float64)
-        return replace(made, zero_hu=float(to_hu(level, problem.mu_ref)))
-
-    @undisturbed
-    def __call__(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Tensor:
-        """Volumes in HU, ``(batch, z, y, x)``, differentiable in ``b``.
+    def normal(self, term: Quadratic) -> Quadratic:
+        """A data term in noise units, on the voxels that the network knows.
 
         Args:
-            problem: of the scan, on voxels of ``voxel_mm``.
-            b: ``(batch, z, y, x)``,
-                :meth:`recon.least_squares.inset_problem.InsetProblem.statistic` of each scan.
-            exposure_s: of the scans.
+            term: in mm⁻¹, of cubic voxels of ``voxel_mm``.
+
+        Raises:
+            ValueError: other voxels.
         """
-        found = self.solved(problem, b, exposure_s)
-        return self.in_hu(problem, found.u, found.normal)
+        if max(abs(s / self.voxel_mm - 1.0) for s in term.spacing) > 0.01:
+            raise ValueError(
+                f"the network works on cubic voxels of {self.voxel_mm:g} mm, got {term.spacing}: "
+                "make the problem on recon.mbir.mbir.working_grid and average the result onto the "
+                "grid"
+            )
+        return replace(term, spacing=(self.voxel_mm,) * 3).in_noise_units()
 
     @undisturbed
-    def solved(self, problem: InsetProblem, b: Tensor, exposure_s: float) -> Reconstructed:
+    def __call__(self, term: Quadratic) -> Tensor:
+        """Volumes in HU, ``(batch, z, y, x)``, differentiable in the term's b.
+
+        Args:
+            term: of scans, in mm⁻¹ on voxels of ``voxel_mm``
+                (:meth:`recon.least_squares.inset_problem.InsetProblem.term`).
+        """
+        found = self.solved(term)
+        return found.normal.hu(found.u)
+
+    @undisturbed
+    def solved(self, term: Quadratic) -> Reconstructed:
         """The same with what it was made of; with something known, what was drawn or why not."""
-        normal = self.problem(problem, b, exposure_s)
+        normal = self.normal(term)
         if self.known is not None:
-            return self._around(self.known, problem, b, exposure_s, normal)
-        n = b.shape[0]
+            return self._around(self.known, term, normal)
+        n = len(term.b)
         return Reconstructed(normal, self.solution(normal), [{} for _ in range(n)], [False] * n)
 
-    def _around(
-        self,
-        known: Known,
-        problem: InsetProblem,
-        b: Tensor,
-        exposure_s: float,
-        normal: NormalisedProblem,
-    ) -> Reconstructed:
+    def _around(self, known: Known, term: Quadratic, normal: Quadratic) -> Reconstructed:
         """Around what is known; where nothing is drawn, or what is drawn is objected to, without
         it."""
-        found = [known.drawn(problem, own, exposure_s, self.fidelity) for own in b]
+        scans = range(len(term.b))
+        found = [known.drawn(term.part([k]), self.fidelity) for k in scans]
         why = [one.why for one in found]
         images = {k: one.image for k, one in enumerate(found) if one.image is not None}
         volumes: dict[int, Tensor] = {}
         if images:
             part = normal.part(list(images))
-            t = self.in_noise_units(problem, torch.stack(list(images.values())), part)
+            t = part.of_hu(torch.stack(list(images.values())))
             # Once what is known is taken off, four turns do what eight do: 0.7 HU rms apart on
             # the paper's plaque.
             network = self.model.network
             quick = (
                 {"prior": partial(network, mirrored=False)} if isinstance(network, Network) else {}
             )
-            u = t + self.solution(replace(part, beta=part.beta - part.apply(t)), **quick)
-            hu = self.in_hu(problem, u.detach(), part)
+            u = t + self.solution(part.less(t), **quick)
+            hu = part.hu(u.detach())
             for k, own, volume in zip(images, u, hu, strict=True):
                 why[k] = found[k].objection(volume)
                 if not why[k]:
                     volumes[k] = own
-        plain = [k for k in range(len(found)) if k not in volumes]
+        plain = [k for k in scans if k not in volumes]
         if plain:
-            without = self.solution(self.problem(problem, b[plain], exposure_s))
-            volumes |= dict(zip(plain, without, strict=True))
-        u = torch.stack([volumes[k] for k in range(len(found))])
+            volumes |= dict(zip(plain, self.solution(normal.part(plain)), strict=True))
+        u = torch.stack([volumes[k] for k in scans])
         notes = [_note(known, *one) for one in zip(found, why, strict=True)]
-        return Reconstructed(normal, u, notes, [k not in plain for k in range(len(found))])
+        return Reconstructed(normal, u, notes, [k not in plain for k in scans])
 
-    def solution(self, normal: NormalisedProblem, **parts: Any) -> Tensor:
+    def solution(self, normal: Quadratic, **parts: Any) -> Tensor:
         """u of a normalised problem, ``(batch, z, y, x)``.
 
         Args:
@@ -266,18 +262,6 @@ class Mbir:
 
         found: Tensor = self.model(normal, self.fidelity, callback=watch, **{**parts, **self.parts})
         return found
-
-    @staticmethod
-    def in_hu(problem: InsetProblem, u: Tensor, normal: NormalisedProblem) -> Tensor:
-        """HU of volumes in noise units."""
-        scale = normal.scale_hu.reshape(-1, 1, 1, 1) * (problem.mu_ref / 1000.0)
-        return to_hu(u * scale + problem.level, problem.mu_ref)
-
-    @staticmethod
-    def in_noise_units(problem: InsetProblem, hu: Tensor, normal: NormalisedProblem) -> Tensor:
-        """The inverse of :meth:`in_hu`."""
-        scale = normal.scale_hu.reshape(-1, 1, 1, 1) * (problem.mu_ref / 1000.0)
-        return (from_hu(hu, problem.mu_ref) - problem.level) / scale
 
     def with_prior(self, prior: Prior | str) -> Self:
         """The same method with another prior.
@@ -311,22 +295,25 @@ class Mbir:
 
     @undisturbed
     @torch.no_grad()
-    def noise_map(
-        self, problem: InsetProblem, b: Tensor, exposure_s: float, draws: int = 8, seed: int = 0
-    ) -> Tensor:
-        """Standard deviation of each voxel in HU, ``(z, y, x)``, of one statistic ``b`` ``(z, y,
-        x)``.
+    def noise_map(self, term: Quadratic, draws: int = 8, seed: int = 0) -> Tensor:
+        """Standard deviation of each voxel in HU, ``(z, y, x)``, of one scan.
 
         The scan is perturbed by fresh noise of its own covariance; the network's response, root
         mean square over ``draws`` and averaged over 3 × 3 × 3 voxels, estimates the noise that the
         volume holds already.
+
+        Args:
+            term: of the scan, in mm⁻¹, a batch of one; its operator is a
+                :class:`recon.gram.gram.Gram`.
+            draws, seed: of the noise.
         """
+        gram: Any = term.operator
         generator = torch.Generator().manual_seed(seed)
-        noise = problem.gram.noise((draws,), generator=generator) * math.sqrt(exposure_s)
+        noise = gram.noise((draws,), generator=generator) * math.sqrt(float(term.scale))
         # Half of the noise in either direction: the response is the local one, and the reference is
         # their mean.
-        both = torch.cat([b + noise / 2, b - noise / 2])
-        volumes = self(problem, both, exposure_s)
+        both = torch.cat([term.b + noise / 2, term.b - noise / 2])
+        volumes = self(replace(term, b=both, scale=term.scale.expand(len(both)), energy=None))
         square = (volumes[:draws] - volumes[draws:]).square().mean(0)
         return torch.nn.functional.avg_pool3d(square[None, None], 3, 1, 1, count_include_pad=False)[
             0, 0

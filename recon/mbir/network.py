@@ -1,6 +1,6 @@
 """The learned prior: a small 3-D U-Net, blind to the unit of its input, that knows the noise level.
 
-It sees two volumes in noise units (:mod:`recon.mbir.problem`), the estimate so far and what a step
+It sees two volumes in noise units (:mod:`recon.data_term`), the estimate so far and what a step
 towards the data would make of it, and gives a new estimate. (To give what must be added, the noise
 with the other sign, takes ten times as long to learn: the noise passes through every layer then.)
 Convolutions have no bias and every nonlinearity is a leaky ReLU, so the network is homogeneous:

@@ -2,7 +2,7 @@
 it is named.
 
 A *prior* is a module or function of four tensors that gives a new estimate ``(batch, z, y, x)``,
-all in noise units (:mod:`recon.mbir.problem`): ``prior(estimate, towards, condition, smoothed)``,
+all in noise units (:mod:`recon.data_term`): ``prior(estimate, towards, condition, smoothed)``,
 see :meth:`recon.mbir.network.Network.forward`. The package's network is one, a network of a user's
 own another.
 

@@ -9,21 +9,16 @@ import torch
 
 from recon.least_squares.field_problem import is_whole_field
 from recon.least_squares.inset_problem import InsetProblem
-from recon.least_squares.surround import CELL_MM, length_unit
-from recon.mbir.field import field_solutions
+from recon.mbir.field import Field
+from recon.mbir.inset import Inset
 from recon.mbir.known import Known
-from recon.mbir.mbir import Mbir, average_onto, working_grid
+from recon.mbir.mbir import Mbir
 from recon.mbir.unrolled import low_residual
-from recon.solution import RESIDUAL_TEST, Solution, tested
+from recon.result import Result
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 
 __all__ = ["reconstruct_mbir"]
-
-
-FARTHEST_CELL = 4.0
-"""Detector cells at the axis may be so many times as large, or as small, as the network's
-voxels: clinical scanners."""
 
 
 def reconstruct_mbir(
@@ -38,7 +33,7 @@ def reconstruct_mbir(
     fidelity: float | None = None,
     noise_map: bool = False,
     known: Known | None = None,
-) -> Iterator[list[Solution]]:
+) -> Iterator[list[Result]]:
     """Unrolled MBIR with the learned prior, of an inset or of a whole field
     (:mod:`recon.mbir.field`).
 
@@ -75,7 +70,7 @@ def reconstruct_mbir(
             of a scanner whose cells have another size than the network's voxels by far; a problem
             that was made for another grid; a fidelity outside of 0 … 1; what is no prior, or
             returns NaN or another kind of volume; for a whole field see
-            :func:`recon.mbir.field.field_solutions`.
+            :class:`recon.mbir.field.Field`.
         FileNotFoundError: the package has no weights.
     """
     if prior is not None:
@@ -92,79 +87,45 @@ def reconstruct_mbir(
             raise ValueError(
                 f"{asked[0]} needs the FFT model of a small inset: ask for a smaller grid"
             )
-        yield from field_solutions(scans, grid, network, progress)
-        return
-    _check_cells(scans[0], network.voxel_mm)
-    work = working_grid(grid, network.voxel_mm)
-    problem = problem or InsetProblem(scans[0], work)
-    if problem.grid != work:
-        raise ValueError(
-            f"the problem was made for another grid: make it on {work} (recon.mbir.working_grid)"
-        )
+        domain: Field | Inset = Field(scans[0], grid, network)
+        batch = 1
+    else:
+        domain = Inset(scans[0], grid, network, problem)
     for i in range(0, len(scans), batch):
         part = scans[i : i + batch]
-        exposure = problem.exposure(part)
-        data = [problem.data(s) for s in part]
-        statistics = [problem.statistic(s, y) for s, y in zip(part, data, strict=True)]
-        b = torch.stack([s.b for s in statistics])
+        seen = domain.scans(part)
         with torch.no_grad():
-            solution = network.solved(problem, b, exposure)
-            normal, u = solution.normal, solution.u
-            left = normal.beta - normal.apply(u)
-            residuals = low_residual(normal, left, network.fidelity).tolist()
-            # ‖y − A u‖²_W less ‖y‖²_W = uᵀ H u − 2 βᵀ u
-            misfit = -(u * (left + normal.beta)).sum(dim=(1, 2, 3), dtype=torch.float64)
-            hu = network.in_hu(problem, u, normal)
+            solved = seen.solved(network)
+            normal, left = solved.normal, solved.normal.left(solved.u)
+            residual = low_residual(seen.whole(normal), left, network.fidelity).tolist()
+            chi2 = normal.chi2(solved.u, left).tolist()
+            volumes = seen.volumes(solved)
         found = []
-        for k, (scan, volume, statistic) in enumerate(zip(part, hu, statistics, strict=True)):
+        for k, (scan, volume) in enumerate(zip(part, volumes, strict=True)):
+            scales = seen.noise_scale_hu(k, normal)
             report: dict[str, Any] = {
                 "method": "mbir",
                 "iterations": network.model.steps,
                 "fidelity": network.fidelity,
-                "residual": residuals[k],
-                "chi2": (statistic.energy + float(misfit[k])) / statistic.readings,
+                "residual": residual[k],
+                "chi2": chi2[k],
+                "noise_scale_hu": scales,
+                "voxel_mm": domain.cell_mm,
                 **network.made_with,
-                **solution.notes[k],
+                **solved.notes[k],
             }
-            seen = network.check(
-                [float(normal.scale_hu[k])], float(volume.max()), scan.unit, problem.mu_ref
-            )
-            warnings = [*report.pop("warnings", []), *seen]
-            tests = []
-            if not scan.noise_free:
-                tests = tested(
-                    RESIDUAL_TEST, warnings, problem.residual_test, scan, volume, data[k]
-                )
-            if solution.drawn[k]:
+            warnings = [*domain.warnings, *report.pop("warnings", [])]
+            warnings += seen.doubts(network, scales)
+            peak = seen.peak_hu(k, solved)
+            warnings += network.check(scales, peak, scan.unit, scan.linearisation.mu_ref)
+            tests = [] if scan.noise_free else seen.tests(k, solved, warnings)
+            if solved.drawn[k]:
                 with torch.no_grad():
-                    plain = network.with_known(None)
-                    changed = volume - plain(problem, statistic.b[None], exposure)[0]
-                report["drawn_minus_plain_hu"] = (
-                    changed if work is grid else average_onto(changed, work, grid)
-                )
+                    changed = volume - network.with_known(None)(seen.term.part([k]))[0]
+                report["drawn_minus_plain_hu"] = domain.onto_grid(changed)
             if noise_map:
-                sd = network.noise_map(problem, statistic.b, exposure)
-                report["noise_sd_hu"] = sd if work is grid else average_onto(sd, work, grid)
-            found.append(
-                Solution(
-                    volume if work is grid else average_onto(volume, work, grid),
-                    report,
-                    warnings,
-                    tests,
-                )
-            )
+                sd = network.noise_map(seen.term.part([k]))
+                report["noise_sd_hu"] = domain.onto_grid(sd)
+            found.append(Result(domain.onto_grid(volume), report, warnings, tests))
         yield found
         progress(min(i + batch, len(scans)) / len(scans))
-
-
-def _check_cells(scan: Scan, voxel_mm: float) -> None:
-    """Refuse a scanner, or a unit of length, on which the network's voxels mean nothing
-    (ValueError)."""
-    cell = length_unit(scan.geometry) * CELL_MM
-    if not 1.0 / FARTHEST_CELL <= cell / voxel_mm <= FARTHEST_CELL:
-        raise ValueError(
-            f"MBIR of an inset works on voxels of {voxel_mm:g} mm, what its network was trained "
-            "for, and the detector "
-            f'cells of this scan have {cell:.3g} mm at the axis: use method="pwls", or check that '
-            "lengths are in mm"
-        )

@@ -25,7 +25,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from recon.mbir.problem import NormalisedProblem, filtered, from_frequencies
+from recon.data_term import Quadratic
+from recon.mbir.frequencies import filtered, from_frequencies
 
 __all__ = ["significant_residual"]
 
@@ -48,15 +49,13 @@ _REACH = 2
 _AXES = (-3, -2, -1)
 
 
-def significant_residual(
-    problem: NormalisedProblem, spectrum: Tensor, u: Tensor, damping: float
-) -> Tensor:
+def significant_residual(problem: Quadratic, spectrum: Tensor, u: Tensor, damping: float) -> Tensor:
     """What ``u`` lacks, ``(batch, z, y, x)``: 0 where nothing but noise is left, and in slices
     smaller than a block.
 
     Args:
         problem: normalised problem.
-        spectrum: of H, :meth:`recon.mbir.problem.NormalisedProblem.spectrum`.
+        spectrum: of H, :meth:`recon.data_term.Quadratic.spectrum`.
         u: the reconstruction, ``(batch, z, y, x)``.
         damping: δ of the step towards the data.
     """
@@ -64,7 +63,7 @@ def significant_residual(
     if min(shape[-2:]) < _BLOCK:
         return torch.zeros_like(u)
     inverse = 1.0 / (spectrum + damping)
-    step = filtered(problem.beta - problem.apply(u), inverse)
+    step = filtered(problem.left(u), inverse)
     correlation = from_frequencies(spectrum * inverse.square(), shape)
     # Slices of a stack that is thinner than a block are looked at one by one.
     edges = [_BLOCK if n >= _BLOCK else 1 for n in shape]

@@ -1,7 +1,7 @@
 """The unrolled reconstruction: data steps and one network in turn, and a final data consistency at
 low frequencies.
 
-In the normalised problem (:mod:`recon.mbir.problem`), f in line pairs per mm:
+In the normalised problem (:mod:`recon.data_term`), f in line pairs per mm:
 
 1. Start: the Wiener filter v = (H + λ + μ f²)⁻¹ β; linear, and the same at every dose.
 2. K times: d = v + (H_c + δ)⁻¹ (β − H v), a step towards the data with the circulant H_c for H in
@@ -34,6 +34,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from recon.conjugate_gradient import conjugate_gradient
+from recon.data_term import Quadratic
+from recon.mbir.frequencies import filtered, squared_frequencies
 from recon.mbir.network import (
     GUIDE_VOXELS,
     REFERENCE_SCALE_HU,
@@ -42,7 +44,6 @@ from recon.mbir.network import (
     edge_preserved,
 )
 from recon.mbir.priors import PlugAndPlay, Prior, prior_of, same_kind
-from recon.mbir.problem import NormalisedProblem, filtered, squared_frequencies
 from recon.mbir.residual import significant_residual
 from torchpcct.switches import undisturbed
 from torchpcct.validate import number, whole
@@ -142,7 +143,7 @@ class Unrolled(nn.Module):
     @undisturbed
     def forward(
         self,
-        problem: NormalisedProblem,
+        problem: Quadratic,
         fidelity: float | Tensor = DEFAULT_FIDELITY,
         callback: Callable[[int, Tensor], None] | None = None,
         steps: int | None = None,
@@ -153,7 +154,7 @@ class Unrolled(nn.Module):
         restore: bool = True,
         solves: tuple[int, int] | None = None,
     ) -> Tensor:
-        """The reconstruction ``(batch, z, y, x)`` in noise units (times ``problem.scale_hu``: HU
+        """The reconstruction ``(batch, z, y, x)`` in noise units (times ``problem.unit_hu``: HU
         above background).
 
         Args:
@@ -177,7 +178,7 @@ class Unrolled(nn.Module):
             ValueError, TypeError: the prior returns something else than a volume like the one that
                 it is given.
         """
-        scale = problem.scale_hu
+        scale = problem.unit_hu
         if self.training:
             low, high = self.seen_scale_hu.unbind()
             least = torch.minimum(torch.where(low > 0, low, math.inf), scale.min())
@@ -188,7 +189,7 @@ class Unrolled(nn.Module):
         level = torch.log(scale / REFERENCE_SCALE_HU).clamp(-3.0, 3.0)
         spectrum = problem.spectrum()
         solves = solves or (_LINEAR_SOLVES if steps == 0 else _SOLVES)
-        noise = guide_noise(spectrum, problem.beta.shape[-3:], problem.voxel_mm)
+        noise = guide_noise(spectrum, problem.b.shape[-3:], problem.voxel_mm)
         v = start(problem, spectrum, solves[0]) if views is None else views[0]
         if callback is not None:
             callback(0, v)
@@ -210,42 +211,42 @@ class Unrolled(nn.Module):
         return u + significant_residual(problem, spectrum, u, _TOWARDS)
 
 
-def bound(prior: Prior, problem: NormalisedProblem, spectrum: Tensor) -> Prior:
+def bound(prior: Prior, problem: Quadratic, spectrum: Tensor) -> Prior:
     """A prior that is told the noise of a problem, if it asks for it; ``spectrum`` is that of
     the problem."""
     if not isinstance(prior, PlugAndPlay):
         return prior
-    noise = guide_noise(spectrum, problem.beta.shape[-3:], problem.voxel_mm, prior.smoothed_by)
+    noise = guide_noise(spectrum, problem.b.shape[-3:], problem.voxel_mm, prior.smoothed_by)
     return prior.told(noise, problem.zero_hu)
 
 
-def first_views(problem: NormalisedProblem, bilateral: bool) -> Views:
+def first_views(problem: Quadratic, bilateral: bool) -> Views:
     """What a network sees in its first step: start, step towards the data, and its filtered view,
     if it has one.
 
     No weight takes part in it, so a training may keep it.
     """
     spectrum = problem.spectrum()
-    noise = guide_noise(spectrum, problem.beta.shape[-3:], problem.voxel_mm)
+    noise = guide_noise(spectrum, problem.b.shape[-3:], problem.voxel_mm)
     return _views(problem, spectrum, start(problem, spectrum), noise, bilateral)
 
 
 def _views(
-    problem: NormalisedProblem, spectrum: Tensor, v: Tensor, noise: Tensor, bilateral: bool
+    problem: Quadratic, spectrum: Tensor, v: Tensor, noise: Tensor, bilateral: bool
 ) -> Views:
-    towards = v + filtered(problem.beta - problem.apply(v), 1.0 / (spectrum + _TOWARDS))
+    towards = v + filtered(problem.left(v), 1.0 / (spectrum + _TOWARDS))
     return v, towards, edge_preserved(towards, noise) if bilateral else None
 
 
-def start(problem: NormalisedProblem, spectrum: Tensor, iterations: int = _SOLVES[0]) -> Tensor:
+def start(problem: Quadratic, spectrum: Tensor, iterations: int = _SOLVES[0]) -> Tensor:
     """The Wiener filter of the data, ``(batch, z, y, x)``; ``spectrum`` is that of the problem."""
     prior = _START[0] + _START[1] * squared_frequencies(
-        problem.beta.shape[-3:], problem.voxel_mm, problem.beta
+        problem.b.shape[-3:], problem.voxel_mm, problem.b
     )
     inverse = 1.0 / (spectrum + prior)
     return conjugate_gradient(
         lambda w: problem.apply(w) + filtered(w, prior),
-        problem.beta,
+        problem.b,
         lambda w: filtered(w, inverse),
         iterations=iterations,
     )
@@ -278,15 +279,15 @@ def guide_noise(
     return ((power * pairs).sum((-3, -2, -1)) / math.prod(shape)).sqrt()
 
 
-def _low_pass(problem: NormalisedProblem, fidelities: Tensor) -> Tensor:
+def _low_pass(problem: Quadratic, fidelities: Tensor) -> Tensor:
     """L on the frequencies of ``rfftn``, ``(batch, z, y, x//2 + 1)``."""
     cut = _CUTOFFS[0] + (_CUTOFFS[1] - _CUTOFFS[0]) * fidelities.reshape(-1, 1, 1, 1)
-    f2 = squared_frequencies(problem.beta.shape[-3:], problem.voxel_mm, problem.beta)
+    f2 = squared_frequencies(problem.b.shape[-3:], problem.voxel_mm, problem.b)
     return torch.exp(-math.log(2.0) * f2 / cut.square())
 
 
 def consistent(
-    problem: NormalisedProblem,
+    problem: Quadratic,
     spectrum: Tensor,
     v: Tensor,
     fidelities: Tensor,
@@ -299,7 +300,7 @@ def consistent(
     inverse = 1.0 / (spectrum + hold)
     return v + conjugate_gradient(
         lambda w: problem.apply(w) + filtered(w, hold),
-        problem.beta - problem.apply(v),
+        problem.left(v),
         lambda w: filtered(w, inverse),
         iterations=iterations,
     )
@@ -332,7 +333,7 @@ def _largest_nearby(v: Tensor) -> Tensor:
     return v
 
 
-def low_residual(problem: NormalisedProblem, left: Tensor, fidelity: float) -> Tensor:
+def low_residual(problem: Quadratic, left: Tensor, fidelity: float) -> Tensor:
     """‖L (β − H u)‖ over ‖L β‖, ``(batch,)``: 0 where the low frequencies are wholly the data's
     own.
 
@@ -341,6 +342,6 @@ def low_residual(problem: NormalisedProblem, left: Tensor, fidelity: float) -> T
         left: β − H u, ``(batch, z, y, x)``.
         fidelity: 0 … 1.
     """
-    low_pass = _low_pass(problem, torch.full_like(problem.scale_hu, fidelity))
-    sizes = [filtered(v, low_pass).flatten(1).norm(dim=1) for v in (left, problem.beta)]
+    low_pass = _low_pass(problem, torch.full_like(problem.unit_hu, fidelity))
+    sizes = [filtered(v, low_pass).flatten(1).norm(dim=1) for v in (left, problem.b)]
     return sizes[0] / sizes[1].clamp_min(torch.finfo(sizes[1].dtype).tiny)

@@ -315,14 +315,15 @@ def compensate(
         if method == "fbp":
             return reference_fbp(scan, grid, estimates[error])
         if network is None or method == "pwls":
-            found, _ = problems[error].solve([scan], DEFAULT_PRIOR, tolerance=_PWLS_TOLERANCE_HU)
+            term = problems[error].term(scan)
+            found, _ = problems[error].solve(term, DEFAULT_PRIOR, tolerance=_PWLS_TOLERANCE_HU)
             return found[0].float()
         # Noise free: as a scan of the study's exposure whose readings happen to be their
         # expectations.
-        b = problems[error].statistic(scan).b * (
-            s.exposure_s / NOISE_FREE_EXPOSURE_S if scan.noise_free else 1.0
-        )
-        return network(problems[error], b[None], s.exposure_s)[0]
+        term = problems[error].term(scan)
+        if scan.noise_free:
+            term = term.times(s.exposure_s / NOISE_FREE_EXPOSURE_S)
+        return network(term)[0]
 
     noise: list[int | None] = [None, *range(s.seed, s.seed + s.realizations)]
     found: dict[Key, list[PlaqueImage]] = {}

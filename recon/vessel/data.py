@@ -13,9 +13,10 @@ from scipy import ndimage
 from torch import Tensor
 
 from recon.conjugate_gradient import conjugate_gradient
+from recon.data_term import Quadratic
 from recon.least_squares.inset_problem import InsetProblem
 from torchpcct.geometry import VolumeGrid
-from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
+from torchpcct.scan import Scan
 from torchpcct.validate import number
 
 __all__ = ["TissueData"]
@@ -67,23 +68,18 @@ class TissueData:
         Raises:
             ValueError: see :class:`recon.least_squares.inset_problem.InsetProblem`.
         """
-        return cls.of_statistic(
-            problem.statistic(scan).b, problem, scan.exposure_s or NOISE_FREE_EXPOSURE_S
-        )
+        return cls.of_term(problem.term(scan))
 
     @classmethod
-    def of_statistic(cls, b: Tensor, problem: Any, exposure_s: float) -> TissueData:
-        """From AᵀW y in the units of a problem (``gram`` at 1 s, ``mu_ref`` and ``level`` in mm⁻¹).
-
-        Args:
-            b: AᵀW y with the background taken off, W that of the exposure.
-            problem: :class:`recon.least_squares.inset_problem.InsetProblem`.
-            exposure_s: of b, s.
-        """
-        gram, hu = problem.gram.scaled(exposure_s), problem.mu_ref / 1000.0
+    def of_term(cls, term: Quadratic) -> TissueData:
+        """From a data term in mm⁻¹, a batch of one volume; its operator is a
+        :class:`recon.gram.gram.Gram`."""
+        model: Any = term.operator
+        gram, hu = model.scaled(float(term.scale)), term.mu_per_hu
         # Attenuation above the background is hu · x + shift.
-        shift = torch.full(tuple(gram.grid.shape), problem.mu_ref - problem.level, dtype=gram.dtype)
-        return cls((b.to(gram.dtype) - gram.apply(shift)) * hu, gram, hu * hu)
+        shift = torch.full(tuple(gram.grid.shape), term.mu_ref - term.zero_mm, dtype=gram.dtype)
+        b = term.b[0].detach().to(gram.dtype)
+        return cls((b - gram.apply(shift)) * hu, gram, hu * hu)
 
     def apply(self, x: Tensor) -> Tensor:
         """G x, HU⁻¹, of volumes in HU ``(..., z, y, x)``."""

@@ -44,7 +44,7 @@ from scipy import ndimage
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from recon.least_squares.inset_problem import InsetProblem
+from recon.data_term import Quadratic
 from recon.mbir.known import Drawn, Known
 from recon.mbir.unrolled import DEFAULT_FIDELITY
 from recon.vessel.data import TissueData
@@ -133,9 +133,9 @@ class KnownVessel:
         "the reconstruction that draws nothing"
     )
 
-    def drawn(self, problem: InsetProblem, b: Tensor, exposure_s: float, fidelity: float) -> Drawn:
+    def drawn(self, term: Quadratic, fidelity: float) -> Drawn:
         """See :meth:`recon.mbir.known.Known.drawn`."""
-        data = TissueData.of_statistic(b.detach(), problem, exposure_s)
+        b, data = term.b[0], TissueData.of_term(term)
         try:
             # Many small matrices: BLAS threads would wait for each other.
             with threadpool_limits(limits=1, user_api="blas"):
@@ -162,7 +162,7 @@ class KnownVessel:
                 return ""
             return f"its outlines leave {highest:.0f} standard deviations of the noise unexplained"
 
-        return Drawn(_Linear.apply(b, estimate, problem.mu_ref / 1000.0), objection=objection)
+        return Drawn(_Linear.apply(b, estimate, term.mu_per_hu), objection=objection)
 
 
 @dataclass(frozen=True)
@@ -184,28 +184,28 @@ class KnownTissues(KnownVessel):
         if self.point is not None:
             object.__setattr__(self, "point", numbers("point", self.point, 3, unit="mm"))
 
-    def drawn(self, problem: InsetProblem, b: Tensor, exposure_s: float, fidelity: float) -> Drawn:
+    def drawn(self, term: Quadratic, fidelity: float) -> Drawn:
         """See :meth:`recon.mbir.known.Known.drawn`; the report holds ``tissues``: what was read, or
         why not."""
         outlines = super().drawn
         try:
-            data = TissueData.of_statistic(b.detach(), problem, exposure_s)
+            data = TissueData.of_term(term)
             reading = read_plaque(data, self.point, vessel_prior=self.vessel_prior)
         except ValueError as error:
             why = f"no tissues were fitted: {error}"
-            return _without(outlines(problem, b, exposure_s, fidelity), why)
+            return _without(outlines(term, fidelity), why)
         if reading.warnings:
             why = f"the fitted tissues were not used: {reading.warnings[0]}"
-            return _without(outlines(problem, b, exposure_s, fidelity), why)
+            return _without(outlines(term, fidelity), why)
         read = {
             "used": True,
             "presence": reading.presence,
             "chi2": reading.chi2,
             "calcifications": reading.calcifications,
         }
-        image, presence = torch.from_numpy(reading.image).to(b), reading.presence
+        image, presence = torch.from_numpy(reading.image).to(term.b), reading.presence
         if presence < _PROVEN:
-            around = outlines(problem, b, exposure_s, fidelity).image
+            around = outlines(term, fidelity).image
             if around is not None:
                 image = presence * image + (1.0 - presence) * around
         return Drawn(image, report={"tissues": read})

@@ -171,7 +171,7 @@ class Draws:
                 ) if "fbp" in kept else None
         if name in SCANNED:
             scan = self.clean(name).with_noise(exposure_s, k)
-            found = {"b": self.problem.statistic(scan).b.numpy()}
+            found = {"b": self.problem.term(scan).b[0].numpy()}
             if name in ("paper", "absent_core"):
                 if self._fbp is None:
                     self._fbp = InsetFbp(self.clean("paper"), [self.grid], ["soft"])
@@ -198,7 +198,7 @@ class Draws:
         if path.exists() or k % what.every:
             return
         b, fbp = self.drawn(what.scene, what.exposure_s, k)
-        data = TissueData.of_statistic(b, self.problem, what.exposure_s)
+        data = TissueData.of_term(self.problem.term_of(b[None], what.exposure_s))
         plaque = scene_of(what.scene)[1] if what.scene in SCANNED else plaque_scene()[1]
         seeds = np.array(plaque.to_scanner([plaque.section("lumen", 0.0)[0], 0.0, 0.0]))[::-1]
         centre, true = np.array(plaque.to_scanner(plaque.core_center))[::-1], truth(plaque)

@@ -24,11 +24,11 @@ from torch import Tensor
 
 from recon.analytic.fbp import fbp
 from recon.conjugate_gradient import dot
+from recon.data_term import Quadratic
 from recon.gram.gram import Gram
 from recon.least_squares.pwls import pwls
 from recon.least_squares.qggmrf import QGGMRF
 from recon.mbir.mbir import Mbir
-from recon.mbir.problem import NormalisedProblem
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, Scan, VolumeGrid, full_turn
 from torchpcct.detector_window import footprint
 from torchpcct.metrics.observer import hotelling_scores
@@ -134,7 +134,9 @@ def methods(n: int, tolerance: float = 1e-3) -> Iterator[Row]:
         **both(lambda v: bound.gradient(v[None])[0], x),
     }
     found = [
-        pwls(A, v, w, prior, mu_per_hu=HU, gram=g, tolerance=tolerance, max_exact=100).x.double()
+        pwls(
+            A, v, w, prior, mu_per_hu=HU, gram=g, tolerance=tolerance, max_exact=100
+        ).volume.double()
         / HU
         for v, w, g in ((y, weights, model), (y.double(), weights.double(), exact))
     ]
@@ -143,12 +145,11 @@ def methods(n: int, tolerance: float = 1e-3) -> Iterator[Row]:
     b = A.T(weights * y)[None]
     volumes = []
     for gram, dtype in ((model, torch.float32), (exact, torch.float64)):
-        normal = NormalisedProblem.from_statistic(
-            gram, b.to(dtype), torch.ones(1), HU, network.voxel_mm
-        )
+        term = Quadratic(gram, b.to(dtype), torch.ones(1), (network.voxel_mm,) * 3, 1000 * HU)
+        normal = term.in_noise_units()
         with torch.no_grad():
             u = network.model.to(dtype)(normal, 0.5)
-        volumes.append((u * normal.scale_hu.reshape(-1, 1, 1, 1)).double())
+        volumes.append((u * normal.unit_hu.reshape(-1, 1, 1, 1)).double())
     yield {"what": "MBIR, HU", **about, **hu(*volumes)}
 
 
@@ -221,7 +222,8 @@ def light_weights(share: float, n: int = 8) -> Row:
         w = torch.where(third, weights * factor, weights)
         data = torch.where(third, y + 1.0, y)
         found.append(
-            pwls(A, data, w, prior, mu_per_hu=HU, tolerance=1e-3, max_exact=100).x.double() / HU
+            pwls(A, data, w, prior, mu_per_hu=HU, tolerance=1e-3, max_exact=100).volume.double()
+            / HU
         )
     return {"what": "PWLS, nearly zero weights", "share": share, **hu(*found)}
 
@@ -242,7 +244,10 @@ def starts(where: str, start: str, n: int = 8) -> Row:
     }[start]
     exact = pwls(A, y.double(), weights.double(), QGGMRF(0.15, 100.0), mu_per_hu=HU, tolerance=0.01)
     found = pwls(A, y, weights, QGGMRF(0.15, 100.0), mu_per_hu=HU, start=first)
-    return {"what": f"PWLS, {where}, from {start}", **hu(found.x.double() / HU, exact.x / HU)}
+    return {
+        "what": f"PWLS, {where}, from {start}",
+        **hu(found.volume.double() / HU, exact.volume / HU),
+    }
 
 
 def refused(what: str, call: Callable[[], Any]) -> Row:

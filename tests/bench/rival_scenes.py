@@ -110,7 +110,7 @@ class Bench:
 
         def compute() -> dict[str, Any]:
             noisy = self.clean.with_noise(dose, k)
-            b = [self.problem.statistic(s).b for s in (noisy, self.clean)]
+            b = [self.problem.term(s).b[0] for s in (noisy, self.clean)]
             return {
                 "fbp": (self.fbp(noisy)[0] - self.fbp(self.clean)[0]).numpy(),
                 "b": (b[0] - dose * b[1]).numpy(),

@@ -31,7 +31,6 @@ from recon.analytic.inset import InsetFbp
 from recon.filters import FILTERS, flat_noise
 from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.least_squares.reconstruct import TOLERANCE_HU
-from torchpcct.volume import to_hu
 
 HERE = Path(__file__).parent
 TUNED = Path(str(recon.evaluate.__path__[0])) / "rivals_tuning.json"
@@ -95,8 +94,8 @@ class Methods:
             return place.fbp[k] + (0.0 if noise is None else noise[0][k])
         b, p = place.b * dose + (0.0 if noise is None else noise[1]), self.bench.problem
         with torch.no_grad():
-            found = p.solve_statistic(b[None], dose, DEFAULT_PRIOR, tolerance=TOLERANCE_HU)
-        return to_hu(found.x + p.level, p.mu_ref)[0]
+            term = p.term_of(b[None], dose)
+            return p.solve(term, DEFAULT_PRIOR, tolerance=TOLERANCE_HU)[0][0]
 
     @lru_cache(maxsize=8)  # noqa: B019
     def covariance(self, kernel: str) -> Any:

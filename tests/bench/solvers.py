@@ -60,7 +60,7 @@ class Problem:
             gram=self.gram,
             tolerance=1e-3,
             max_exact=60,
-        ).x
+        ).volume
 
     def rmsd(self, x: Tensor) -> float:
         """Root mean square distance to the minimum, HU."""
@@ -79,7 +79,7 @@ def ours(p: Problem) -> Iterator[tuple[float, float, float]]:
         result = pwls(
             p.A, p.y, p.w, p.prior, mu_per_hu=p.hu, gram=p.gram, tolerance=1e-6, max_exact=most
         )
-        yield result.report["exact_pairs"], time.perf_counter() - start, p.rmsd(result.x)
+        yield result.report["exact_pairs"], time.perf_counter() - start, p.rmsd(result.volume)
 
 
 def fista(p: Problem, iterations: int = 60) -> Iterator[tuple[float, float, float]]:

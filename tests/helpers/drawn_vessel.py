@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import torch
-from inset_operators import HU, problem
+from inset_operators import HU, problem, term_of
 
 from recon.gram.gram import Gram
 from recon.mbir.mbir import Mbir
@@ -100,11 +100,12 @@ def inset():
 
 
 def statistic(drawn, seen, seed, exposure_s=1.0):
-    """``(1, z, y, x)`` b of HU on ``gram.finer`` in an :func:`inset`; noise of a seed, None:
-    without noise."""
+    """The data term of HU on ``gram.finer`` in an :func:`inset`; noise of a seed, None: without
+    noise."""
     noise = 0.0 if seed is None else drawn.gram.noise(generator=torch.Generator().manual_seed(seed))
     clean = drawn.gram.statistic((seen / 1000.0 + 1.0) * drawn.mu_ref - drawn.level)
-    return (exposure_s * clean + exposure_s**0.5 * noise)[None]
+    b = (exposure_s * clean + exposure_s**0.5 * noise)[None]
+    return term_of(drawn, b, exposure_s)
 
 
 def untrained():

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import torch
 
+from recon.data_term import Quadratic
 from torchpcct import ConeBeam, Projector, VolumeGrid
 from torchpcct.detector_window import footprint
 from torchpcct.geometry import full_turn
@@ -29,6 +30,12 @@ def problem(views=240, shape=(8, 13, 13), voxel=0.4, rows=10, dtype=torch.float3
     path = 2 * np.sqrt(120.0**2 - (626.0 * np.sin(np.clip(gamma, -0.17, 0.17))) ** 2)
     w = torch.from_numpy(115 * np.exp(0.0185 * (240 - path)))[:, None]
     return A, w.expand(A.range_shape).to(dtype).contiguous()
+
+
+def term_of(inset, b, exposure_s=1.0):
+    """The data term of b ``(batch, z, y, x)`` of an inset that is given by its attributes."""
+    scale = torch.full((len(b),), exposure_s, dtype=torch.float64)
+    return Quadratic(inset.gram, b, scale, inset.grid.spacing, inset.mu_ref, inset.level)
 
 
 def matrix(operator, shape, dtype=torch.float64):

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from recon.mbir.problem import NormalisedProblem
 from recon.mbir.unrolled import first_views
 from train.config import DataConfig, Situation
 from train.data import ROIS, Data, Views, turn
@@ -35,13 +34,13 @@ def test_pure_function_of_seed_step_and_index(data, tmp_path):
     """Also where the views come from another file."""
     whole = data.batch(5, BATCH, range(4))
     again, other = Data(CONFIG, 3, tmp_path), Data(CONFIG, 4, tmp_path)
-    again._grams = other._grams = data._grams
+    again._terms = other._terms = data._terms
     part = again.batch(5, BATCH, [2, 0])
     assert whole.size == 4
-    assert whole.problem.beta.shape == (12, *CONFIG.shape)
+    assert whole.problem.b.shape == (12, *CONFIG.shape)
     for name in ("truth", "contrast", "voxels", "lots", "edges", "bodies"):
         assert torch.equal(getattr(whole, name)[[2, 0]], getattr(part, name)), name
-    assert torch.equal(whole.problem.beta[[2, 0, 6, 4, 10, 8]], part.problem.beta)
+    assert torch.equal(whole.problem.b[[2, 0, 6, 4, 10, 8]], part.problem.b)
     assert not torch.equal(whole.truth, data.batch(4, BATCH, range(4)).truth)
     assert not torch.equal(whole.truth[2], other.batch(5, BATCH, [2]).truth[0])
 
@@ -63,7 +62,7 @@ def test_two_draws_of_noise_are_independent_of_each_other_and_of_other_scenes(da
     for step in range(3):
         batch = data.batch(step, BATCH, range(4))
         p, n = batch.problem, batch.size
-        noise = p.beta[: 2 * n] - torch.cat([p.beta[2 * n :], p.beta[2 * n :]])
+        noise = p.b[: 2 * n] - torch.cat([p.b[2 * n :], p.b[2 * n :]])
         assert torch.corrcoef(noise.flatten(1)).fill_diagonal_(0.0).abs().max() < 0.5
         assert torch.pdist(batch.truth.flatten(1).sort(1).values).min() > 1.0
         probe = torch.zeros(CONFIG.shape)
@@ -81,10 +80,10 @@ def test_views_are_those_of_the_method(data):
     for kept, made in zip(batch.views, found, strict=True):
         assert kept is not None
         assert float((kept - made).abs().max()) < 0.02 * float(made.std())
-    scale = batch.problem.scale_hu[8:].reshape(-1, 1, 1, 1)
+    scale = batch.problem.unit_hu[8:].reshape(-1, 1, 1, 1)
     signal = batch.problem.part(range(8, 12))
-    error = signal.beta - signal.apply(batch.truth / scale)
-    assert float(error.std()) < 0.2 * float(signal.beta.std())
+    error = signal.b - signal.apply(batch.truth / scale)
+    assert float(error.std()) < 0.2 * float(signal.b.std())
 
 
 def test_contrasts_are_differences_of_means(data):
@@ -108,7 +107,7 @@ def test_contrasts_are_differences_of_means(data):
 
 
 def test_exposures_lie_in_their_range(data):
-    scales = torch.cat([data.batch(step, BATCH, range(4)).problem.scale_hu for step in range(3)])
+    scales = torch.cat([data.batch(step, BATCH, range(4)).problem.unit_hu for step in range(3)])
     ratio = float(scales.max() / scales.min())
     assert 1.1 < ratio < 1.3 * math.sqrt(4.0)  # two situations: their information differs
 
@@ -133,7 +132,7 @@ def test_views_are_computed_once(data, tmp_path, monkeypatch):
     ahead = Data(few, 3, tmp_path)
     ahead.prepare(1)
     used = Data(few, 3, tmp_path / "other")
-    used._grams = data._grams
+    used._terms = data._terms
     with monkeypatch.context() as patch:
         patch.setattr(Data, "_seen", lambda *a: pytest.fail("computed again"))
         again = Data(few, 3, tmp_path)
@@ -156,11 +155,11 @@ def test_a_gpu_computes_the_views_that_the_cpu_would(data, tmp_path, monkeypatch
     free = [90, 90, 10]
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free.pop(0), 100))
     ahead = Data(few, 3, tmp_path)
-    ahead._accelerated, ahead._grams = True, data._grams
+    ahead._accelerated, ahead._terms = True, data._terms
     ahead.prepare(1)
     assert sorted(ahead._on_device) == [0, 1]
     plain = Data(few, 3, tmp_path / "other")
-    plain._grams = data._grams
+    plain._terms = data._terms
     for number in range(2):
         one, other = ahead.sample(number), plain.sample(number)
         assert one is ahead._on_device[number]
@@ -191,13 +190,3 @@ def test_a_disk_that_is_too_small_is_noticed_at_the_start(tmp_path, monkeypatch)
     with pytest.raises(OSError, match=r"no room for .* GB of views .*--views"):
         Views(tmp_path, CONFIG, 1)
     assert not [p for p in tmp_path.rglob("*") if p.is_file()]
-
-
-def test_beta_in_noise_units_makes_the_same_problem(data):
-    gram, hu = data.gram(0)
-    b = torch.randn(2, *CONFIG.shape)
-    exposure = torch.tensor([0.5, 2.0])
-    one = NormalisedProblem.from_statistic(gram, b, exposure, hu, 0.4)
-    other = NormalisedProblem.with_beta(gram, one.beta, exposure, hu, 0.4)
-    assert torch.equal(one.scale_hu, other.scale_hu)
-    assert torch.equal(one.factor, other.factor)

@@ -28,9 +28,9 @@ class Given(nn.Module):
     def forward(self, problem, fidelity, steps=None, views=None, prior=None):
         self.steps.append(steps)
         self.fidelities.append(fidelity)
-        self.sizes.append(len(problem.beta))
+        self.sizes.append(len(problem.b))
         volumes = self.volumes(problem) if callable(self.volumes) else self.volumes
-        return torch.zeros_like(problem.beta) if volumes is None else volumes
+        return torch.zeros_like(problem.b) if volumes is None else volumes
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def data(tmp_path_factory):
 
 
 def truth_of(batch):
-    return torch.cat([batch.truth, batch.truth]) / batch.problem.scale_hu[: 2 * batch.size].reshape(
+    return torch.cat([batch.truth, batch.truth]) / batch.problem.unit_hu[: 2 * batch.size].reshape(
         -1, 1, 1, 1
     )
 
@@ -61,7 +61,7 @@ def test_terms_by_their_definitions(data):
     mean of H 1."""
     batch = data.batch(0, 4, range(2))
     noisy = batch.problem.part(range(4))
-    error = 0.3 * torch.ones_like(noisy.beta)
+    error = 0.3 * torch.ones_like(noisy.b)
     parts = Objective(ObjectiveConfig(edge=0.0))(Given(truth_of(batch) + error), batch).parts
     assert parts["white"] == pytest.approx(2 * 0.09, rel=1e-4)
     assert parts["data"] == pytest.approx(
@@ -120,8 +120,8 @@ def test_the_scene_without_noise_counts_with_its_weight(data):
     free = []
 
     def off_by_a_constant(problem):
-        scene = torch.tensor([0, 1, 0, 1, *free])[: len(problem.beta)]
-        return batch.truth[scene] / problem.scale_hu.reshape(-1, 1, 1, 1) + 0.3
+        scene = torch.tensor([0, 1, 0, 1, *free])[: len(problem.b)]
+        return batch.truth[scene] / problem.unit_hu.reshape(-1, 1, 1, 1) + 0.3
 
     model = Given(off_by_a_constant)
     without = Objective(ObjectiveConfig(contrast=0.0))(model, batch)
@@ -166,7 +166,7 @@ def test_validation_is_relative_to_the_filter(data):
     """The filter in the network's place has ratios of 1; half of its error has half of them,
     whatever the scene."""
     held_out = Data(replace(CONFIG, scenes_kept=8), 9, data.views.folder.parent)
-    held_out._grams = data._grams
+    held_out._terms = data._terms
     assert math.isfinite(
         Objective().validate(Unrolled(NetworkConfig((4, 4, 4), 0.4)).eval(), held_out).score
     )

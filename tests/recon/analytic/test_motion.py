@@ -174,9 +174,9 @@ def test_compensated_fbp_shows_the_inset_at_rest(scans, path):
 def test_compensated_pwls_shows_the_inset_at_rest(scans, path):
     prior = QGGMRF(strength=0.3, threshold=300.0)
     problem = InsetProblem(scans[0.0], GRID)
-    rest, _ = problem.solve([scans[0.0]], prior, tolerance=2.0)
+    rest, _ = problem.solve(problem.term(scans[0.0]), prior, tolerance=2.0)
     moved = problem.with_motion(path)
-    found, report = moved.solve([scans[2.0]], prior, tolerance=2.0)
+    found, report = moved.solve(moved.term(scans[2.0]), prior, tolerance=2.0)
     assert report["converged"]
     assert report["exact_pairs"] <= 6
     assert float((found - rest).square().mean().sqrt()) < 12.0

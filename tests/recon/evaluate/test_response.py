@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from inset_operators import HU, problem, tissue
+from inset_operators import HU, problem, term_of, tissue
 
 from recon.evaluate.response import response, statistic_covariance
 from recon.gram.gram import Gram
@@ -40,23 +40,26 @@ def weights():
     return found
 
 
-def method(p, **parts):
+def method(**parts):
     """Random weights; without its steps it is linear."""
     torch.manual_seed(1)
     model = Unrolled(NetworkConfig((6, 8, 8), 0.4), 2)
     torch.nn.init.normal_(model.network.leave.weight, std=0.02)
     network = Mbir(model.double(), **parts)
-    return lambda b: network(p, b, DOSE)
+    return network
 
 
 def test_of_a_linear_method_is_its_matrix(inset, weights):
     p, b = inset
-    run = method(p, steps=0)
+    run = method(steps=0)
     n, size = math.prod(SHAPE), 1e-2 / HU
     eye = size * torch.eye(n, dtype=torch.float64).reshape(n, *SHAPE)
-    zero = run(torch.zeros_like(eye[:1]))
-    dense = ((torch.cat([run(part) for part in eye.split(128)]) - zero).reshape(n, n) / size).T
-    found = response(run, p, weights, b, DOSE).reshape(3, -1)
+    zero = run(term_of(p, torch.zeros_like(eye[:1]), DOSE))
+    dense = (
+        (torch.cat([run(term_of(p, part, DOSE)) for part in eye.split(128)]) - zero).reshape(n, n)
+        / size
+    ).T
+    found = response(run, p, weights, term_of(p, b[None], DOSE), DOSE).reshape(3, -1)
     expected = weights.reshape(3, -1) @ dense
     assert float((found - expected).norm() / expected.norm()) < 2e-4
 
@@ -65,10 +68,12 @@ def test_follows_a_network(inset, weights):
     """g·b of draws that it was not averaged over is correlated with the method's own means, and
     of equal size."""
     p, b = inset
-    run = method(p)
-    g = response(run, p, weights, b, DOSE)
+    run = method()
+    g = response(run, p, weights, term_of(p, b[None], DOSE), DOSE)
     noise = p.gram.noise((200,), generator=torch.Generator().manual_seed(5)).to(b) * DOSE**0.5
-    drawn = torch.einsum("nzyx,rzyx->nr", run(b + noise).detach(), weights).numpy()
+    drawn = torch.einsum(
+        "nzyx,rzyx->nr", run(term_of(p, b + noise, DOSE)).detach(), weights
+    ).numpy()
     linear = torch.einsum("nzyx,rzyx->nr", b + noise, g).numpy()
     for k in range(3):
         assert np.corrcoef(drawn[:, k], linear[:, k])[0, 1] > 0.9

@@ -70,7 +70,7 @@ def test_an_unfinished_iteration_warns_on_the_volume(clean, problem):
 def test_refusals(clean):
     whole = replace(clean, geometry=clean.geometry, window=clean.window)
     with pytest.raises(ValueError, match="one exposure"):
-        InsetProblem(clean, GRID).solve([clean.with_noise(1.0, 0), clean.with_noise(2.0, 0)], WEAK)
+        reconstruct([clean.with_noise(t, 0) for t in (1.0, 2.0)], GRID, "pwls", batch=2)
     spectral = replace(
         whole, counts=clean.counts[None], air=clean.air[None], surround=clean.surround[None]
     )

@@ -94,15 +94,15 @@ def test_exact_minimum(inset, dense, prior):
     fine = pwls(
         A, y.double(), f.double(), prior, mu_per_hu=1.0, gram=gram, tolerance=1e-6, max_exact=80
     )
-    x = reference(dense, f, y, bound, A.domain_shape, fine.x)
+    x = reference(dense, f, y, bound, A.domain_shape, fine.volume)
     result = pwls(A, y, f, prior, mu_per_hu=1.0, gram=gram, tolerance=0.02)
     assert result.report["converged"]
-    assert result.x.shape == (2, *A.domain_shape)
-    assert rms(result.x, x) < 0.06
+    assert result.volume.shape == (2, *A.domain_shape)
+    assert rms(result.volume, x) < 0.06
     assert result.report["gradient"][-1] < 1e-3
     # float64 takes it to the digits of the reference.
-    assert fine.x.dtype == torch.float64
-    assert rms(fine.x, x) < 1e-5
+    assert fine.volume.dtype == torch.float64
+    assert rms(fine.volume, x) < 1e-5
 
 
 def test_certificate_is_the_gradient_of_the_objective(inset):
@@ -116,7 +116,7 @@ def test_certificate_is_the_gradient_of_the_objective(inset):
         return torch.autograd.grad(value, x)[0].norm()
 
     result = pwls(A, y, f, EDGE, mu_per_hu=1.0, gram=gram, tolerance=0.5)
-    measured = float(gradient(result.x) / gradient(torch.zeros(2, *A.domain_shape)))
+    measured = float(gradient(result.volume) / gradient(torch.zeros(2, *A.domain_shape)))
     assert measured == pytest.approx(result.report["gradient"][-1], rel=0.02)
 
 
@@ -130,18 +130,20 @@ def test_correlation_that_changes_from_ray_to_ray_is_information():
     truth = tissue(A.grid)
     y = A(truth) + correlated_noise(f, (6,), 3)
     weak = quadratic(0.02)
-    joint = pwls(A, y, f, weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60).x
-    alone = pwls(A, y, w * (1 - 0.81), weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60).x
+    joint = pwls(A, y, f, weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60).volume
+    alone = pwls(A, y, w * (1 - 0.81), weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60).volume
     clean = A(truth).expand_as(y)
     scatter = rms(
         joint,
-        pwls(A, clean[0], f, weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60).x.expand_as(joint),
+        pwls(A, clean[0], f, weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60).volume.expand_as(
+            joint
+        ),
     )
     apart = rms(
         alone,
         pwls(
             A, clean[0], w * (1 - 0.81), weak, mu_per_hu=1.0, tolerance=0.2, max_exact=60
-        ).x.expand_as(alone),
+        ).volume.expand_as(alone),
     )
     assert scatter == pytest.approx(math.sqrt(0.19) * apart, rel=0.15)
 
@@ -164,7 +166,7 @@ def test_lost_rays_may_hold_anything(inset):
         tolerance=0.1,
         max_exact=40,
     )
-    assert rms(result.x, full.x) < 0.3
+    assert rms(result.volume, full.volume) < 0.3
 
 
 def test_refusals(inset):

@@ -92,9 +92,9 @@ def test_finds_the_dense_minimum(scan, prior):
     found = pwls(A, y, w, prior, mu_per_hu=HU, tolerance=0.5)
     assert found.report["converged"]
     assert found.report["model"] == "gradient"
-    assert hu_rms(found.x, exact) < 1.0
-    assert hu_rms(found.x, exact) < 3 * found.report["rmsd_hu"][-1]
-    residual = (w * (y - A(found.x)).square()).sum() / (w > 0).sum()
+    assert hu_rms(found.volume, exact) < 1.0
+    assert hu_rms(found.volume, exact) < 3 * found.report["rmsd_hu"][-1]
+    residual = (w * (y - A(found.volume)).square()).sum() / (w > 0).sum()
     assert found.report["misfit"] == [pytest.approx(float(residual), rel=1e-3)]
 
 
@@ -118,7 +118,7 @@ def test_every_pair_lowers_the_objective(scan):
                 start=start,
                 tolerance=1e-9,
                 max_exact=pairs,
-            ).x
+            ).volume
             values.append(energy(matrix, y, w, bound, x))
         slack = 1e-6 * energy(matrix, y, w, bound, torch.zeros(A.domain_shape))
         assert all(b <= a + slack for a, b in itertools.pairwise(values)), values
@@ -129,8 +129,8 @@ def test_batch_is_each_alone(scan):
     A, y, w, _ = scan
     both = pwls(A, torch.stack([y, 0.5 * y]), w, EDGE, mu_per_hu=HU, tolerance=0.3)
     assert len(both.report["misfit"]) == 2
-    for data, x in zip((y, 0.5 * y), both.x, strict=True):
-        assert hu_rms(x, pwls(A, data, w, EDGE, mu_per_hu=HU, tolerance=0.3).x) < 1.0
+    for data, x in zip((y, 0.5 * y), both.volume, strict=True):
+        assert hu_rms(x, pwls(A, data, w, EDGE, mu_per_hu=HU, tolerance=0.3).volume) < 1.0
 
 
 def test_voxels_that_some_views_miss_converge_last_and_that_is_said():
@@ -146,8 +146,8 @@ def test_voxels_that_some_views_miss_converge_last_and_that_is_said():
     bound = EDGE.bind(FieldModel(A, w).information(HU), A.grid.spacing, HU)
     exact = exact_minimum(matrix, A, y, w, bound)
     found = pwls(A, y, w, bound, mu_per_hu=HU, tolerance=1.0)
-    assert hu_rms(found.x[r < 11], exact[r < 11]) < 2.0
-    assert found.report["rmsd_hu"][-1] > hu_rms(found.x, exact) / 3
+    assert hu_rms(found.volume[r < 11], exact[r < 11]) < 2.0
+    assert found.report["rmsd_hu"][-1] > hu_rms(found.volume, exact) / 3
 
 
 def test_a_flat_prior_is_not_called_converged_before_it_is(scan):
@@ -156,7 +156,7 @@ def test_a_flat_prior_is_not_called_converged_before_it_is(scan):
     exact = exact_minimum(matrix, A, y, w, bound)
     for pairs in (20, 60):
         found = pwls(A, y, w, bound, mu_per_hu=HU, tolerance=1.0, max_exact=pairs)
-        assert found.report["rmsd_hu"][-1] > hu_rms(found.x, exact) / 3
+        assert found.report["rmsd_hu"][-1] > hu_rms(found.volume, exact) / 3
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +182,7 @@ def test_flat_faces_in_a_cone_beam_need_a_spectrum_of_their_own_slice(flat_faces
     assert many.report["converged"]
     assert one.report["converged"]
     assert many.report["exact_pairs"] < 0.6 * one.report["exact_pairs"]
-    assert hu_rms(many.x, one.x) < 0.5
+    assert hu_rms(many.volume, one.volume) < 0.5
 
 
 def test_slices_beyond_the_rows_do_not_slow_the_rest_down(monkeypatch):
@@ -231,7 +231,7 @@ def test_model_is_chosen_by_the_grid_and_dropped_by_its_misfit():
     assert wrong.report["model_misfit"] > 1
     assert wrong.report["model"] == "gradient"
     assert wrong.report["converged"]
-    assert hu_rms(right.x, wrong.x) < 0.2
+    assert hu_rms(right.volume, wrong.volume) < 0.2
 
 
 def test_information_is_that_of_the_fft_model():

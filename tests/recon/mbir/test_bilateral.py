@@ -153,7 +153,7 @@ def test_overshoot_of_strong_edges_is_cut_off_and_weak_structures_stay(level, no
 def test_noise_of_the_guide_is_that_of_draws(normalised):
     """White spectra of two sizes: the formula against drawn noise through the same steps."""
     problem, towards = normalised
-    found = guide_noise(problem.spectrum(), problem.beta.shape[-3:], problem.voxel_mm)
+    found = guide_noise(problem.spectrum(), problem.b.shape[-3:], problem.voxel_mm)
     inner = local_mean(towards, GUIDE_VOXELS)[:, 6:-6, 6:-6, 6:-6]
     assert float(inner.std()) == pytest.approx(float(found[0]), rel=0.1)
 
@@ -161,26 +161,26 @@ def test_noise_of_the_guide_is_that_of_draws(normalised):
 @pytest.fixture(scope="module")
 def normalised():
     """Noise alone, and the first step towards it."""
-    from recon.mbir.problem import NormalisedProblem, filtered
+    from recon.mbir.frequencies import filtered
     from recon.mbir.unrolled import start
     from train.config import DataConfig
-    from train.data import situation_gram
+    from train.data import situation_term
 
     config = DataConfig(shape=(28, 28, 28), views=120)
-    gram, hu = situation_gram(config.situations[0], config)
-    noise = gram.noise((8,), generator=torch.Generator().manual_seed(0))
-    problem = NormalisedProblem.from_statistic(gram, noise, torch.ones(8), hu, config.voxel_mm)
+    empty = situation_term(config.situations[0], config)
+    noise = empty.operator.noise((8,), generator=torch.Generator().manual_seed(0))
+    problem = replace(empty, b=noise, scale=torch.ones(8)).in_noise_units()
     spectrum = problem.spectrum()
     v = start(problem, spectrum)
-    return problem, v + filtered(problem.beta - problem.apply(v), 1.0 / (spectrum + 0.1))
+    return problem, v + filtered(problem.b - problem.apply(v), 1.0 / (spectrum + 0.1))
 
 
 @pytest.mark.extended
 def test_unrolled_with_the_filter_is_differentiable_in_the_data(normalised):
     problem, _ = normalised
     model = Unrolled(replace(CONFIG, voxel_mm=0.2), steps=1).eval()
-    beta = problem.beta[:1].clone().requires_grad_()
-    one = replace(problem, beta=beta, scale_hu=problem.scale_hu[:1], factor=problem.factor[:1])
+    beta = problem.b[:1].clone().requires_grad_()
+    one = replace(problem, b=beta, unit=problem.unit_hu[:1], scale=problem.scale[:1])
     model(one).square().sum().backward()
     assert bool(torch.isfinite(beta.grad).all())
     assert float(beta.grad.abs().max()) > 0

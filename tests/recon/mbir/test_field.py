@@ -8,11 +8,12 @@ import pytest
 import torch
 
 from recon import reconstruct
+from recon.data_term import Quadratic
 from recon.least_squares.field_problem import FieldProblem
 from recon.mbir.field import FieldGram, _turned, blockwise, trained_grid
+from recon.mbir.frequencies import filtered
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import Network, NetworkConfig
-from recon.mbir.problem import NormalisedProblem, filtered
 from torchpcct import ConeBeam, ParallelBeam, Projector, Scan, VolumeGrid, full_turn
 
 MU = 0.02
@@ -47,9 +48,9 @@ def test_noise_looks_the_same_everywhere_in_noise_units():
     slices = problem.slices(scan)
     gram = FieldGram(problem, [w for _, w in slices], 0.2)
     b = gram.ratio * torch.stack([problem.projector.T(w * y) for y, w in slices])
-    normal = NormalisedProblem.from_statistic(gram, b[None], torch.ones(1), HU, 0.2)
-    u = truth / HU / (normal.scale_hu * gram.ratio)
-    noise = (normal.beta - normal.apply(u[None]))[0]
+    normal = Quadratic(gram, b[None], torch.ones(1), (0.2,) * 3, 1000 * HU).in_noise_units()
+    u = truth / HU / (normal.unit_hu * gram.ratio)
+    noise = (normal.b - normal.apply(u[None]))[0]
     expected = float(normal.spectrum().expand(1, 8, 48, 25).mean())
     r = torch.hypot(
         *torch.meshgrid(*[torch.from_numpy(a) for a in SLICES.slice.axes], indexing="ij")
@@ -150,10 +151,9 @@ def test_a_step_towards_the_data_is_not_mostly_noise_where_rays_beside_the_middl
             for k, (_, w) in enumerate(slices)
         ]
     )
-    normal = NormalisedProblem.from_statistic(
-        gram, (gram.ratio * noise)[None], torch.ones(1), HU, 0.2
-    )
-    step = filtered(normal.beta, 1.0 / (normal.spectrum() + 0.1))[0]
+    b = (gram.ratio * noise)[None]
+    normal = Quadratic(gram, b, torch.ones(1), (0.2,) * 3, 1000 * HU).in_noise_units()
+    step = filtered(normal.b, 1.0 / (normal.spectrum() + 0.1))[0]
     y, x = torch.meshgrid(*[torch.from_numpy(a) for a in SLICES.slice.axes], indexing="ij")
     # Noise of covariance H becomes H / (H + 0.1)², 2.5 at most, wherever H is what it is taken for.
     for part in ((y.abs() > 5) & (torch.hypot(y, x) < 10), torch.hypot(y, x) < 3):

@@ -58,12 +58,7 @@ def test_noise_map_is_the_noise(clean, problem, network):
     scans = [clean.with_noise(2.0, s) for s in range(24)]
     volumes = reconstruct(scans, GRID, "mbir", network=network, problem=problem)
     measured = torch.stack([v.data for v in volumes]).var(0).mean().sqrt()
-    estimated = (
-        network.noise_map(problem, problem.statistic(scans[0]).b, 2.0, draws=16)
-        .square()
-        .mean()
-        .sqrt()
-    )
+    estimated = network.noise_map(problem.term(scans[0]), draws=16).square().mean().sqrt()
     assert float(estimated / measured) == pytest.approx(1.0, abs=0.15)
 
 
@@ -78,9 +73,9 @@ def test_residual_and_chi2_by_their_definitions(clean, problem, network):
     assert report["chi2"] == pytest.approx(
         float((problem.weights * rest.square()).sum() / y.numel()), rel=2e-3
     )
-    normal = network.problem(problem, problem.statistic(scan).b[None], 1.0)
-    u = x[None] * 1000.0 / problem.mu_ref / normal.scale_hu
-    expected = float(low_residual(normal, normal.beta - normal.apply(u), network.fidelity))
+    normal = network.normal(problem.term(scan))
+    u = x[None] * 1000.0 / problem.mu_ref / normal.unit_hu
+    expected = float(low_residual(normal, normal.b - normal.apply(u), network.fidelity))
     assert report["residual"] == pytest.approx(expected, rel=0.01)
 
 
@@ -152,23 +147,25 @@ def test_refusals(clean, problem, network, tmp_path):
         reconstruct(
             clean, VolumeGrid((4, 9, 9), 0.4, CENTER), "mbir", network=network, problem=problem
         )
-    with pytest.raises(ValueError, match="one exposure"):
-        reconstruct(
-            [clean.with_noise(t, 0) for t in (1.0, 2.0)],
-            GRID,
-            "mbir",
-            network=network,
-            problem=problem,
-        )
     coarse = InsetProblem(clean, VolumeGrid((4, 9, 9), 0.8, CENTER))
     with pytest.raises(ValueError, match=r"voxels of 0\.4 mm"):
-        network(coarse, torch.zeros(1, 4, 9, 9), 1.0)
+        network(coarse.term(clean))
     with pytest.raises(FileNotFoundError, match="no weights"):
         Mbir.load(tmp_path / "none.safetensors")
     bad = tmp_path / "bad.safetensors"
     bad.write_bytes(b"not weights")
     with pytest.raises(ValueError, match="holds no weights"):
         Mbir.load(bad)
+
+
+def test_scans_of_several_exposures_may_be_one_batch(clean, problem, network):
+    scans = [clean.with_noise(t, 0) for t in (1.0, 2.0)]
+    given = {"network": network, "problem": problem}
+    together = reconstruct(scans, GRID, "mbir", **given)
+    for scan, volume in zip(scans, together, strict=True):
+        alone = reconstruct(scan, GRID, "mbir", **given)
+        torch.testing.assert_close(volume.data, alone.data, rtol=0, atol=1e-2)
+        assert volume.report["noise_scale_hu"] == alone.report["noise_scale_hu"]
 
 
 def test_shadow_of_dead_readings(clean, problem, network):
@@ -198,8 +195,8 @@ def test_metal_is_outside_of_what_the_prior_knows(network):
 def always_drawn(monkeypatch):
     """Something is drawn of every scan."""
 
-    def drawn(self, problem, b, exposure_s, fidelity):
-        image = torch.full(tuple(b.shape), -90.0)
+    def drawn(self, term, fidelity):
+        image = torch.full(term.shape, -90.0)
         image[2:6, 6:10, 6:10] = 60.0
         return Drawn(image)
 

@@ -11,6 +11,7 @@ from small_scan import GRID
 from torch import nn
 
 from recon import reconstruct
+from recon.data_term import Quadratic
 from recon.evaluate import method_of
 from recon.filters import denoiser_of, perona_malik
 from recon.gram.gram import Gram
@@ -18,7 +19,6 @@ from recon.mbir.field import blockwise
 from recon.mbir.mbir import WEIGHTS_FORMAT, Mbir
 from recon.mbir.network import Network, NetworkConfig, bilateral_prior
 from recon.mbir.priors import PlugAndPlay, name_of, network_of, prior_of
-from recon.mbir.problem import NormalisedProblem
 from recon.mbir.unrolled import Unrolled, first_views, guide_noise
 from recon.mbir.weights_io import write_tensors
 from torchpcct import Volume, VolumeGrid
@@ -57,7 +57,7 @@ def normal():
     b = gram.apply(tissue(A.grid))[None] + gram.noise(
         (2,), generator=torch.Generator().manual_seed(0)
     )
-    return NormalisedProblem.from_statistic(gram, b, torch.ones(2), HU, VOXEL)
+    return Quadratic(gram, b, torch.ones(2), (VOXEL,) * 3, 1000 * HU).in_noise_units()
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ def test_a_prior_is_any_module_or_function_of_the_four_tensors(normal):
         (seen[0][0], seen[0][1], seen[0][3]), first_views(normal, True), strict=True
     ):
         assert torch.equal(given, expected)
-    level = torch.log(normal.scale_hu / 200.0)
+    level = torch.log(normal.unit_hu / 200.0)
     torch.testing.assert_close(
         seen[0][2], torch.stack([level, torch.full((2,), 0.2), torch.zeros(2)], 1)
     )
@@ -205,15 +205,15 @@ def test_a_denoiser_sees_hu_and_is_told_the_noise_of_what_it_sees(normal):
         seen.append((volume, sigma))
         return volume
 
-    gram = normal.gram
+    gram = normal.operator
     noise = gram.noise((96,), generator=torch.Generator().manual_seed(1))
-    draws = NormalisedProblem.from_statistic(gram, noise, torch.ones(96), HU, VOXEL)
-    draws = NormalisedProblem(gram, draws.beta, draws.scale_hu, draws.factor, VOXEL, zero_hu=-90.0)
+    draws = Quadratic(gram, noise, torch.ones(96), (VOXEL,) * 3, 1000 * HU, level=910 * HU)
+    draws = draws.in_noise_units()
     Unrolled(denoise, 1, voxel_mm=VOXEL).eval()(draws)
     volumes = torch.stack([v for v, _ in seen])
     assert seen[0][1] == pytest.approx(float((volumes + 90.0).square().mean().sqrt()), rel=0.04)
     assert float(volumes.mean()) == pytest.approx(-90.0, abs=0.1 * seen[0][1])
-    scales = draws.scale_hu.reshape(-1, 1, 1, 1)
+    scales = draws.unit_hu.reshape(-1, 1, 1, 1)
     torch.testing.assert_close(
         (volumes + 90.0) / scales, first_views(draws, False)[1], rtol=1e-4, atol=1e-4
     )

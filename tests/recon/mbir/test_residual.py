@@ -2,13 +2,15 @@
 found."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from inset_operators import HU, problem
 
+from recon.data_term import Quadratic
 from recon.gram.gram import Gram
-from recon.mbir.problem import NormalisedProblem, filtered
+from recon.mbir.frequencies import filtered
 from recon.mbir.residual import significant_residual
 
 DAMPING = 0.1
@@ -26,11 +28,11 @@ def left(gram, x, noise, batch=1):
     reconstructed yet."""
     generator = torch.Generator().manual_seed(3)
     b = gram.apply(x * HU) + noise * gram.noise((batch,), generator=generator)
-    return NormalisedProblem.from_statistic(gram, b, torch.ones(batch), HU, 0.4)
+    return Quadratic(gram, b, torch.ones(batch), (0.4,) * 3, 1000 * HU).in_noise_units()
 
 
 def found(p):
-    return significant_residual(p, p.spectrum(), torch.zeros_like(p.beta), DAMPING)
+    return significant_residual(p, p.spectrum(), torch.zeros_like(p.b), DAMPING)
 
 
 def bars(shape, hu):
@@ -41,7 +43,7 @@ def bars(shape, hu):
 def test_noise_is_left_where_it_is(gram):
     """One in six billion coefficients passes: nothing is put into nearly all volumes of noise."""
     p = left(gram, torch.zeros(SHAPE), 1.0, batch=100)
-    step = filtered(p.beta, 1.0 / (p.spectrum() + DAMPING))
+    step = filtered(p.b, 1.0 / (p.spectrum() + DAMPING))
     found_of_noise = found(p)
     assert int(found_of_noise.flatten(1).any(1).sum()) <= 8
     assert float(found_of_noise.square().mean()) < 1e-5 * float(step.square().mean())
@@ -52,7 +54,7 @@ def test_a_pattern_is_followed_to_where_it_is_weaker(gram):
     tall = (18, 24, 72)
     A, w = problem(shape=tall, rows=20)
     wide = Gram(A, w, nodes=1)
-    scale = float(left(wide, torch.zeros(tall), 1.0).scale_hu)
+    scale = float(left(wide, torch.zeros(tall), 1.0).unit_hu)
     fading = bars(tall, scale) * torch.linspace(1.5, 0.0, tall[-1])
     v = found(left(wide, fading, 1.0))[0] * scale
     middle = (..., slice(30, 42))
@@ -63,7 +65,7 @@ def test_a_pattern_is_followed_to_where_it_is_weaker(gram):
 def test_weak_bars_are_put_back(gram):
     """At half of the noise of a voxel no bar is seen, together they are beyond doubt."""
     empty = left(gram, torch.zeros(SHAPE), 1.0)
-    scale = float(empty.scale_hu)
+    scale = float(empty.unit_hu)
     pattern = bars(SHAPE, scale / 2)
     v = found(left(gram, pattern, 1.0))[0] * scale
     share = float((v * pattern).sum() / pattern.square().sum())
@@ -74,7 +76,7 @@ def test_weak_bars_are_put_back(gram):
 def test_without_noise_it_is_the_step_towards_the_data(gram):
     """Blocks add up to the volume; what is far below the noise stays out."""
     p = left(gram, bars(SHAPE, 5000.0), 0.0)
-    v, pattern = found(p)[0] * float(p.scale_hu), bars(SHAPE, 5000.0)
+    v, pattern = found(p)[0] * float(p.unit_hu), bars(SHAPE, 5000.0)
     inside = (slice(2, -2), slice(3, -3), slice(3, -3))
     share = (v * pattern)[inside].sum() / pattern[inside].square().sum()
     assert 0.8 < float(share) < 1.1
@@ -84,7 +86,7 @@ def test_without_noise_it_is_the_step_towards_the_data(gram):
 def test_mirrored_data_give_the_mirrored_volume(gram):
     """Blocks lie symmetrically; the projector has the symmetry along z."""
     p = left(gram, bars(SHAPE, 40.0), 1.0)
-    other = NormalisedProblem(gram, p.beta.flip(-3), p.scale_hu, p.factor, 0.4)
+    other = replace(p, b=p.b.flip(-3))
     torch.testing.assert_close(found(other).flip(-3), found(p), rtol=1e-3, atol=1e-4)
 
 
@@ -103,15 +105,15 @@ def test_slices_smaller_than_a_block_hold_no_pattern():
 
 def test_it_is_differentiable(gram):
     p = left(gram, bars(SHAPE, 80.0), 1.0)
-    beta = p.beta.clone().requires_grad_(True)
+    beta = p.b.clone().requires_grad_(True)
     v = significant_residual(
-        NormalisedProblem(gram, beta, p.scale_hu, p.factor, 0.4),
+        replace(p, b=beta),
         p.spectrum(),
         torch.zeros_like(beta),
         DAMPING,
     )
     v.sum().backward()
     step = torch.randn(beta.shape, generator=torch.Generator().manual_seed(0))
-    moved = found(NormalisedProblem(gram, p.beta + 1e-4 * step, p.scale_hu, p.factor, 0.4))
+    moved = found(replace(p, b=p.b + 1e-4 * step))
     expected = float((beta.grad * step).sum()) * 1e-4
     assert float((moved - v.detach()).sum()) == pytest.approx(expected, rel=0.05, abs=1e-4)

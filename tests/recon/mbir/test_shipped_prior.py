@@ -12,16 +12,16 @@ from types import SimpleNamespace
 import drawn_vessel
 import pytest
 import torch
-from inset_operators import HU, problem
+from inset_operators import HU, problem, term_of
 from scipy import ndimage
 from torch import nn
 
 from recon.analytic.backproject import backproject
 from recon.analytic.fbp import filter_sinogram
 from recon.gram.gram import Gram
+from recon.mbir.frequencies import filtered
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import NetworkConfig
-from recon.mbir.problem import filtered
 from recon.mbir.residual import significant_residual
 from recon.mbir.unrolled import (
     REFERENCE_SCALE_HU,
@@ -71,6 +71,7 @@ def found(drawn, request):
     noise = torch.randn((2, *drawn.readings.shape), generator=generator)
     y = drawn.readings + noise / (drawn.w * exposure).sqrt()
     b, network = drawn.A.T(drawn.w * exposure * y), Mbir.load()
+    term = term_of(drawn.scan, b, exposure)
     kernels = filter_sinogram(
         y, drawn.A.geometry, ["soft", "standard"], drawn.A.window, held=drawn.A.window
     )
@@ -81,10 +82,10 @@ def found(drawn, request):
         volumes = {
             "soft": soft,
             "standard": standard,
-            "mbir": network(drawn.scan, b, exposure),
-            "linear": Mbir(network.model, network.fidelity, steps=0)(drawn.scan, b, exposure),
+            "mbir": network(term),
+            "linear": Mbir(network.model, network.fidelity, steps=0)(term),
         }
-        normal = network.problem(drawn.scan, b, exposure)
+        normal = network.normal(term)
         free = network.model(normal, network.fidelity, final_data_consistency=False)
     return SimpleNamespace(
         exposure=exposure,
@@ -92,7 +93,7 @@ def found(drawn, request):
         normal=normal,
         fidelity=network.fidelity,
         free=free,
-        out=network.in_noise_units(drawn.scan, volumes["mbir"], normal),
+        out=normal.of_hu(volumes["mbir"]),
     )
 
 
@@ -105,7 +106,7 @@ def error(drawn, found, method, place):
 
 def energy(normal, u):
     """½ uᵀHu − βᵀu: the misfit of the data, but for a constant."""
-    return float((0.5 * u * normal.apply(u) - normal.beta * u).sum(dtype=torch.float64))
+    return float((0.5 * u * normal.apply(u) - normal.b * u).sum(dtype=torch.float64))
 
 
 @pytest.mark.parametrize(
@@ -133,7 +134,7 @@ def test_fat_and_lumen_keep_their_values(drawn, found):
 
 def test_final_data_consistency_makes_the_network_s_volume_explain_the_data(found):
     left = [
-        low_residual(found.normal, found.normal.beta - found.normal.apply(u), found.fidelity).max()
+        low_residual(found.normal, found.normal.b - found.normal.apply(u), found.fidelity).max()
         for u in (found.free, found.out)
     ]
     assert left[1] < 0.4 * left[0]
@@ -162,12 +163,12 @@ def test_the_network_is_given_a_step_towards_the_data_and_where_it_is(found):
     assert len(model.network.seen) == 2
     for k, (u, towards, condition) in enumerate(model.network.seen):
         torch.testing.assert_close(u, before)
-        left = normal.beta - normal.apply(u)
+        left = normal.b - normal.apply(u)
         torch.testing.assert_close(
             towards - u, filtered(left, 1.0 / (spectrum + 0.1)), rtol=1e-3, atol=1e-3
         )
         assert energy(normal, towards) < energy(normal, u)
-        level = torch.log(normal.scale_hu / REFERENCE_SCALE_HU)
+        level = torch.log(normal.unit_hu / REFERENCE_SCALE_HU)
         torch.testing.assert_close(
             condition, torch.stack([level, 0.25 + 0 * level, k + 0 * level], 1)
         )
@@ -182,11 +183,10 @@ def striped(drawn):
     network, exposure, generator = Mbir.load(), 40.0, torch.Generator().manual_seed(0)
     noise = torch.randn(drawn.readings.shape, generator=generator)
     y = drawn.readings + noise / (drawn.w * exposure).sqrt()
-    normal = network.problem(drawn.scan, drawn.A.T(drawn.w * exposure * y)[None], exposure)
-    stripes = 8.0 * torch.sin(2.0 * math.pi * torch.arange(normal.beta.shape[-1]) / 5.0)
-    normal = replace(
-        normal, beta=normal.beta + normal.apply(stripes.expand(normal.beta.shape).contiguous())
-    )
+    b = drawn.A.T(drawn.w * exposure * y)[None]
+    normal = network.normal(term_of(drawn.scan, b, exposure))
+    stripes = 8.0 * torch.sin(2.0 * math.pi * torch.arange(normal.b.shape[-1]) / 5.0)
+    normal = replace(normal, b=normal.b + normal.apply(stripes.expand(normal.b.shape).contiguous()))
     steps = []
 
     def run(callback=None, **options):
@@ -243,7 +243,7 @@ def test_every_switch_takes_its_part_out_and_nothing_else(striped):
         return striped.model.network(*seen)
 
     torch.testing.assert_close(striped.run(prior=listening), striped.all)
-    noise = guide_noise(spectrum, normal.beta.shape[-3:], normal.voxel_mm)
+    noise = guide_noise(spectrum, normal.b.shape[-3:], normal.voxel_mm)
     torch.testing.assert_close(striped.cut, limited(striped.data, given[-1][3], noise))
     assert float((striped.cut - striped.data).abs().max()) > 0.5
     back = significant_residual(normal, spectrum, striped.cut, 0.1)

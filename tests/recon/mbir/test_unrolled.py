@@ -8,9 +8,10 @@ import pytest
 import torch
 from inset_operators import HU, matrix, problem, tissue
 
+from recon.data_term import Quadratic
 from recon.gram.gram import Gram
+from recon.mbir.frequencies import filtered, squared_frequencies
 from recon.mbir.network import NetworkConfig, bilateral_prior
-from recon.mbir.problem import NormalisedProblem, filtered, squared_frequencies
 from recon.mbir.unrolled import Unrolled, fidelity_frequency, first_views, low_residual, start
 
 SMALL = NetworkConfig((6, 8, 8), 0.4)
@@ -40,7 +41,9 @@ def normal(scan, exposure=1.0, noise=0.0, seed=0, batch=1):
     if noise:
         generator = torch.Generator().manual_seed(seed)
         b = b + noise * math.sqrt(exposure) * gram.noise((batch,), generator=generator)
-    return NormalisedProblem.from_statistic(gram, b, torch.full((batch,), exposure), HU, 0.4)
+    return Quadratic(
+        gram, b, torch.full((batch,), exposure), (0.4,) * 3, 1000 * HU
+    ).in_noise_units()
 
 
 def test_normalisation(scan):
@@ -48,9 +51,9 @@ def test_normalisation(scan):
     by √2."""
     gram, _, _ = scan
     one, two = normal(scan), normal(scan, exposure=2.0)
-    assert float(two.scale_hu / one.scale_hu) == pytest.approx(1 / math.sqrt(2))
+    assert float(two.unit_hu / one.unit_hu) == pytest.approx(1 / math.sqrt(2))
     torch.testing.assert_close(one.spectrum(), two.spectrum())
-    assert float(one.scale_hu) == pytest.approx((gram.information(HU) * 0.4**3) ** -0.5)
+    assert float(one.unit_hu) == pytest.approx((gram.information(HU) * 0.4**3) ** -0.5)
     assert 0.1 < float(one.spectrum()[0, 0, 2, 2]) < 10
 
 
@@ -58,17 +61,15 @@ def test_start_is_the_wiener_filter(scan):
     """(H + λ + μ f²)⁻¹ β by a dense solve; the few steps leave about a per cent."""
     p = normal(scan, noise=1.0)
     prior = 0.01 + 0.8 * squared_frequencies(SHAPE, 0.4).double()
-    dense = matrix(lambda v: p.gram.apply(v) * p.factor[0].double() + filtered(v, prior), SHAPE)
-    exact = torch.linalg.solve(0.5 * (dense + dense.T), p.beta.double().reshape(-1)).reshape(SHAPE)
+    dense = matrix(lambda v: p.operator.apply(v) * p.scale[0].double() + filtered(v, prior), SHAPE)
+    exact = torch.linalg.solve(0.5 * (dense + dense.T), p.b.double().reshape(-1)).reshape(SHAPE)
     found = start(p, p.spectrum())[0].double()
     assert float((found - exact).norm() / exact.norm()) < 0.03
 
 
 def test_no_steps_are_linear(scan):
     net, first, second = model(), normal(scan, noise=1.0, seed=1), normal(scan, noise=1.0, seed=2)
-    both = NormalisedProblem(
-        first.gram, first.beta - 2 * second.beta, first.scale_hu, first.factor, 0.4
-    )
+    both = replace(first, b=first.b - 2 * second.b)
     found = [net(p, steps=0) for p in (first, second, both)]
     torch.testing.assert_close(found[2], found[0] - 2 * found[1], rtol=1e-3, atol=1e-3)
     whole = [net(p) for p in (first, second, both)]
@@ -84,9 +85,7 @@ def test_final_data_consistency(scan):
     left = {}
     for fidelity in (0.0, 0.5, 1.0):
         free, bound = (loud(p, fidelity, final_data_consistency=word) for word in (False, True))
-        left[fidelity] = [
-            float(low_residual(p, p.beta - p.apply(u), fidelity)) for u in (free, bound)
-        ]
+        left[fidelity] = [float(low_residual(p, p.b - p.apply(u), fidelity)) for u in (free, bound)]
         assert left[fidelity][1] < 0.35 * left[fidelity][0]
         # Both networks agree on them.
         low = torch.exp(
@@ -101,7 +100,7 @@ def test_final_data_consistency(scan):
             for w in (False, True)
         ]
         assert apart[1] < 0.6 * apart[0]
-    assert low_residual(p, p.beta, 0.5) == pytest.approx(1.0)
+    assert low_residual(p, p.b, 0.5) == pytest.approx(1.0)
 
 
 def test_another_prior_takes_the_place_of_the_network(scan):
@@ -140,9 +139,8 @@ def test_batch_equals_single(scan):
     generator = torch.Generator().manual_seed(0)
     noise = scan[0].noise((3,), generator=generator)
     for k in range(3):
-        p = NormalisedProblem.from_statistic(
-            scan[0], (scan[2] + noise[k])[None], torch.ones(1), HU, 0.4
-        )
+        p = Quadratic(scan[0], (scan[2] + noise[k])[None], torch.ones(1), (0.4,) * 3, 1000 * HU)
+        p = p.in_noise_units()
         torch.testing.assert_close(net(p)[0], together[k], rtol=1e-4, atol=1e-4)
 
 
@@ -158,7 +156,7 @@ def test_noise_levels_of_the_training_are_kept(scan):
     net = model().train()
     for exposure in (1.0, 4.0, 0.5):
         net(normal(scan, exposure))
-    expected = [float(normal(scan, e).scale_hu) for e in (4.0, 0.5)]
+    expected = [float(normal(scan, e).unit_hu) for e in (4.0, 0.5)]
     assert net.seen_scale_hu.tolist() == pytest.approx(expected)
     net.eval()(normal(scan, 100.0))
     assert net.seen_scale_hu.tolist() == pytest.approx(expected)
@@ -169,7 +167,7 @@ def test_extreme_data_stay_in_proportion(scan, size):
     """Homogeneous of degree one at a given noise scale: from nothing to a million times the
     statistic."""
     net, p = model(), normal(scan, noise=1.0)
-    scaled = NormalisedProblem(p.gram, p.beta * size, p.scale_hu, p.factor, 0.4)
+    scaled = replace(p, b=p.b * size)
     found, expected = net(scaled), net(p) * size
     assert torch.isfinite(found).all()
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=float(expected.abs().max()) * 1e-5)

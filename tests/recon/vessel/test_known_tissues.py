@@ -42,11 +42,11 @@ def solved(drawn, network, fine):
     """Without and with tissues, HU, and the notes."""
     b = statistic(drawn, fine, 1)
     method = network.with_known(KnownTissues())
-    found = method.solved(drawn, b, 1.0)
+    found = method.solved(b)
     with torch.no_grad():
         return (
-            network(drawn, b, 1.0)[0],
-            method.in_hu(drawn, found.u, found.normal)[0],
+            network(b)[0],
+            found.normal.hu(found.u)[0],
             found.notes[0],
         )
 
@@ -75,22 +75,22 @@ def test_the_data_are_kept(drawn, network, solved, fine):
     """The low frequencies of the residual are as small as without tissues, the fit to the data
     is better."""
     b = statistic(drawn, fine, 1)
-    normal = network.problem(drawn, b, 1.0)
+    normal = network.normal(b)
     rest = []
     for volume in solved[:2]:
         u = (
-            volume[None] / normal.scale_hu
-            + (drawn.mu_ref - drawn.level) * 1000.0 / drawn.mu_ref / normal.scale_hu
+            volume[None] / normal.unit_hu
+            + (drawn.mu_ref - drawn.level) * 1000.0 / drawn.mu_ref / normal.unit_hu
         )
-        left = normal.beta - normal.apply(u)
-        rest.append(-float((u * (left + normal.beta)).sum(dtype=torch.float64)))
+        left = normal.b - normal.apply(u)
+        rest.append(-float((u * (left + normal.b)).sum(dtype=torch.float64)))
     assert rest[1] < rest[0]
 
 
 def test_without_a_vessel_it_is_the_plain_reconstruction(drawn, network):
     b = statistic(drawn, torch.full(drawn.gram.finer.shape, -90.0), 2)
-    found = network.with_known(KnownTissues()).solved(drawn, b, 1.0)
-    assert torch.equal(found.u, network.solved(drawn, b, 1.0).u.detach())
+    found = network.with_known(KnownTissues()).solved(b)
+    assert torch.equal(found.u, network.solved(b).u.detach())
     assert not found.notes[0]["tissues"]["used"]
     assert "no tissues were fitted" in found.notes[0]["warnings"][0]
 
@@ -100,8 +100,8 @@ def test_tissues_that_do_not_explain_the_data_are_not_used(drawn, network, fine,
     reading = known.read_plaque
     monkeypatch.setattr(known, "read_plaque", lambda *a, **k: replace(reading(*a, **k), chi2=2.0))
     b = statistic(drawn, fine, 1)
-    found = network.with_known(KnownTissues()).solved(drawn, b, 1.0)
-    assert torch.equal(found.u, network.solved(drawn, b, 1.0).u.detach())
+    found = network.with_known(KnownTissues()).solved(b)
+    assert torch.equal(found.u, network.solved(b).u.detach())
     assert "residual is 2.00" in found.notes[0]["warnings"][0]
 
 
@@ -115,19 +115,19 @@ def test_what_is_believed_of_the_vessel_reaches_the_reading(drawn, network, fine
     monkeypatch.setattr(known, "read_plaque", reading)
     b = statistic(drawn, fine, 1)
     for believed in (None, VesselPrior(wall=(20.0, 5.0))):
-        network.with_known(KnownTissues(believed)).with_fidelity(1.0).solved(drawn, b, 1.0)
+        network.with_known(KnownTissues(believed)).with_fidelity(1.0).solved(b)
     assert seen == [None, VesselPrior(wall=(20.0, 5.0))]
 
 
 @pytest.mark.extended
 def test_a_core_is_drawn_as_far_as_it_is_probable(drawn, network, fine, monkeypatch):
-    b = statistic(drawn, fine, 1)[0]
-    reading = read_plaque(TissueData.of_statistic(b, drawn, 1.0))
+    b = statistic(drawn, fine, 1)
+    reading = read_plaque(TissueData.of_term(b))
     monkeypatch.setattr(
         known, "read_plaque", lambda *arguments, **settings: replace(reading, presence=0.25)
     )
-    around = KnownVessel().drawn(drawn, b, 1.0, network.fidelity).image
-    found = KnownTissues().drawn(drawn, b, 1.0, network.fidelity).image
+    around = KnownVessel().drawn(b, network.fidelity).image
+    found = KnownTissues().drawn(b, network.fidelity).image
     assert torch.allclose(found, 0.25 * torch.from_numpy(reading.image) + 0.75 * around, atol=1e-3)
     assert float((around - torch.from_numpy(reading.image)).abs().max()) > 20.0
 
@@ -152,8 +152,8 @@ def test_another_fidelity_keeps_the_tissues_and_noise_units_are_the_inverse_of_h
     assert isinstance(method.known, KnownTissues)
     assert (method.fidelity, method.known.point) == (1.0, (0.0, 0.0, 1.0))
     assert network.fidelity != 1.0
-    normal = network.problem(drawn, statistic(drawn, fine, 1), 1.0)
-    back = method.in_hu(drawn, method.in_noise_units(drawn, truth[None], normal), normal)
+    normal = network.normal(statistic(drawn, fine, 1))
+    back = normal.hu(normal.of_hu(truth[None]))
     assert torch.allclose(back[0], truth, atol=1e-3)
 
 

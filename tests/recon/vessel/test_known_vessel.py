@@ -1,11 +1,14 @@
 """MBIR around the outlines of a vessel: sharper where they fit, the plain reconstruction where
 they do not."""
 
+from dataclasses import replace
+
 import drawn_vessel
 import numpy as np
 import pytest
 import torch
 
+from recon.data_term import Quadratic
 from recon.vessel import VesselPrior, known
 from recon.vessel.known import KnownVessel
 
@@ -18,19 +21,16 @@ def statistic(drawn, image, seed):
 
 @pytest.fixture(scope="module")
 def vessel(drawn):
-    """b of a vessel with a core of 100 HU of contrast, drawn on voxels of half the size."""
+    """The data term of a vessel with a core of 100 HU of contrast, drawn on finer voxels."""
     return statistic(drawn, drawn_vessel.image(drawn.gram.finer, 100.0, samples=3), 1)
 
 
 def test_outlines_are_sharper_and_the_layer_keeps_what_the_data_show(drawn, network):
     truth = drawn_vessel.image(drawn.grid, 100.0)
     vessel = statistic(drawn, drawn_vessel.image(drawn.gram.finer, 100.0, samples=3), None)
-    found = network.with_known(KnownVessel()).solved(drawn, vessel, EXPOSURE_S)
+    found = network.with_known(KnownVessel()).solved(vessel)
     assert found.notes[0]["vessel"]["drawn"]
-    plain, around = (
-        network.in_hu(drawn, s.u, s.normal)[0].detach()
-        for s in (network.solved(drawn, vessel, EXPOSURE_S), found)
-    )
+    plain, around = (s.normal.hu(s.u)[0].detach() for s in (network.solved(vessel), found))
     inside = truth > -80
     error = [float((v - truth)[inside].square().mean().sqrt()) for v in (plain, around)]
     assert error[1] < 0.6 * error[0]
@@ -41,8 +41,8 @@ def test_outlines_are_sharper_and_the_layer_keeps_what_the_data_show(drawn, netw
 
 def test_without_a_vessel_it_is_the_plain_reconstruction(drawn, network):
     b = statistic(drawn, torch.full(drawn.gram.finer.shape, -90.0), 2)
-    found = network.with_known(KnownVessel()).solved(drawn, b, EXPOSURE_S)
-    assert torch.equal(found.u, network.solved(drawn, b, EXPOSURE_S).u)
+    found = network.with_known(KnownVessel()).solved(b)
+    assert torch.equal(found.u, network.solved(b).u)
     assert "nothing stands out" in found.notes[0]["vessel"]["why"]
     assert found.notes[0]["warnings"] == [f"no vessel was drawn: {found.notes[0]['vessel']['why']}"]
 
@@ -56,9 +56,9 @@ def test_outlines_that_leave_something_unexplained_are_not_drawn(drawn, network)
     )
     near = (z - bright[0]) ** 2 + (y - bright[1] - 12) ** 2 + (x - bright[2]) ** 2 < 36
     b = statistic(drawn, torch.where(near, torch.tensor(900.0), image), 3)
-    found = network.with_known(KnownVessel()).solved(drawn, b, EXPOSURE_S)
+    found = network.with_known(KnownVessel()).solved(b)
     assert not found.notes[0]["vessel"]["drawn"]
-    assert torch.equal(found.u, network.solved(drawn, b, EXPOSURE_S).u)
+    assert torch.equal(found.u, network.solved(b).u)
 
 
 def test_what_lies_apart_from_a_vessel_does_not_speak_against_it(drawn, network):
@@ -70,10 +70,10 @@ def test_what_lies_apart_from_a_vessel_does_not_speak_against_it(drawn, network)
     muscle = y - drawn_vessel.TILT * z[:, None] < -(wall + 1.2)
     beside = torch.where(muscle[:, :, None], torch.tensor(0.0), image)
     b = statistic(drawn, beside, 3)
-    found = network.with_known(KnownVessel()).solved(drawn, b, EXPOSURE_S)
+    found = network.with_known(KnownVessel()).solved(b)
     assert found.notes[0]["vessel"]["drawn"], found.notes[0]
-    plain = network.solved(drawn, b, EXPOSURE_S)
-    volumes = [network.in_hu(drawn, f.u, f.normal)[0].detach() for f in (found, plain)]
+    plain = network.solved(b)
+    volumes = [f.normal.hu(f.u)[0].detach() for f in (found, plain)]
     assert float((volumes[0] - volumes[1])[:, 0].mean()) == pytest.approx(0.0, abs=5.0)
 
 
@@ -84,38 +84,39 @@ def test_a_vessel_of_what_is_no_tissue_is_not_drawn(drawn, network, values, tiss
     """Inflamed fat about a lumen, contrast agent beside a flap: both are fitted, and explain the
     data."""
     b = statistic(drawn, drawn_vessel.image(drawn.gram.finer, 0.0, samples=3, **values), 4)
-    found = network.with_known(KnownVessel()).solved(drawn, b, EXPOSURE_S)
+    found = network.with_known(KnownVessel()).solved(b)
     assert f"its {tissue}" in found.notes[0]["vessel"]["why"]
-    assert torch.equal(found.u, network.solved(drawn, b, EXPOSURE_S).u)
+    assert torch.equal(found.u, network.solved(b).u)
 
 
 def test_scenes_of_a_batch_are_what_they_are_alone(drawn, network, vessel):
     empty = statistic(drawn, torch.full(drawn.gram.finer.shape, -90.0), 2)
     method = network.with_known(KnownVessel())
-    both = method.solved(drawn, torch.cat([empty, vessel]), EXPOSURE_S)
+    both = method.solved(Quadratic.joined([empty, vessel]))
     for k, alone in enumerate((empty, vessel)):
-        assert torch.allclose(both.u[k], method.solved(drawn, alone, EXPOSURE_S).u[0], atol=2e-3)
+        assert torch.allclose(both.u[k], method.solved(alone).u[0], atol=2e-3)
     assert [n["vessel"]["drawn"] for n in both.notes] == [False, True]
     assert ["no vessel" in n["warnings"][0] for n in both.notes] == [True, False]
     assert "may be missing: compare" in both.notes[1]["warnings"][0]
     assert both.drawn == [False, True]
-    plain = method.with_known(None).solved(drawn, vessel, EXPOSURE_S)
-    assert torch.equal(plain.u, network.solved(drawn, vessel, EXPOSURE_S).u)
+    plain = method.with_known(None).solved(vessel)
+    assert torch.equal(plain.u, network.solved(vessel).u)
     assert plain.drawn == [False]
 
 
 def test_it_is_differentiable_with_the_fit(drawn, network, vessel):
     """Against a finite difference of the whole method, fitted anew on both sides."""
     method = network.with_known(KnownVessel()).with_fidelity(1.0)
-    b = vessel.clone().requires_grad_()
-    weights = torch.from_numpy(np.random.default_rng(0).standard_normal(vessel.shape)).float()
-    direction = statistic(drawn, torch.full(drawn.gram.finer.shape, -910.0), 5) * 0.02
-    (method(drawn, b, EXPOSURE_S) * weights).sum().backward()
+    b = vessel.b.clone().requires_grad_()
+    weights = torch.from_numpy(np.random.default_rng(0).standard_normal(b.shape)).float()
+    direction = statistic(drawn, torch.full(drawn.gram.finer.shape, -910.0), 5).b * 0.02
+
+    def weighed(b):
+        return (method(replace(vessel, b=b)) * weights).sum(dtype=torch.float64)
+
+    weighed(b).backward()
     with torch.no_grad():
-        there = [
-            (method(drawn, vessel + s * direction, EXPOSURE_S) * weights).sum(dtype=torch.float64)
-            for s in (0.5, -0.5)
-        ]
+        there = [weighed(vessel.b + s * direction) for s in (0.5, -0.5)]
     assert float((b.grad * direction).sum()) == pytest.approx(float(there[0] - there[1]), rel=0.06)
 
 
@@ -125,7 +126,7 @@ def test_more_fidelity_leaves_more_of_the_contrast_and_of_the_noise(drawn, netwo
     contrast, noise = [], []
     for fidelity in (0.0, 1.0):
         clean, without, noisy = (
-            KnownVessel().drawn(drawn, statistic(drawn, image, seed)[0], EXPOSURE_S, fidelity).image
+            KnownVessel().drawn(statistic(drawn, image, seed), fidelity).image
             for image, seed in ((images[0], None), (images[1], None), (images[1], 7))
         )
         contrast.append(float((without - clean)[core].mean()))
@@ -142,23 +143,18 @@ def test_what_is_believed_of_the_vessel_reaches_the_fit(drawn, network, vessel, 
         raise ValueError("seen")
 
     monkeypatch.setattr(known, "Vessel", refused)
-    network.with_known(KnownVessel("a prior")).solved(drawn, vessel, EXPOSURE_S)
+    network.with_known(KnownVessel("a prior")).solved(vessel)
     assert seen == ["a prior"]
 
 
 def test_all_values_moved_move_the_volume(drawn, network, vessel):
     """The zero of the scanner is 150 HU off: so is the volume, whose outlines do not ask where
     it lies."""
-    moved = vessel + EXPOSURE_S * drawn.gram.apply(
-        torch.full_like(vessel, 150.0 * drawn.mu_ref / 1000.0)
-    )
+    moved = vessel.less(torch.full_like(vessel.b, -150.0 * drawn.mu_ref / 1000.0))
     changes = []
     for believed in (None, VesselPrior()):
-        found = [
-            network.with_known(KnownVessel(believed)).solved(drawn, b, EXPOSURE_S)
-            for b in (vessel, moved)
-        ]
+        found = [network.with_known(KnownVessel(believed)).solved(b) for b in (vessel, moved)]
         assert all(f.notes[0]["vessel"]["drawn"] for f in found)
-        still, other = (network.in_hu(drawn, f.u, f.normal)[0].detach() for f in found)
+        still, other = (f.normal.hu(f.u)[0].detach() for f in found)
         changes.append(float((other - still - 150.0)[still > -40].square().mean().sqrt()))
     assert changes[0] < min(5.0, 0.5 * changes[1]), changes

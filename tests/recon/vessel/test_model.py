@@ -160,7 +160,7 @@ def test_data_of_a_scan_in_hu(problem, clean):
     volume = 30.0 * torch.randn(problem.grid.shape, generator=torch.Generator().manual_seed(0))
     hu = problem.mu_ref / 1000
     attenuation = (volume / 1000 + 1) * problem.mu_ref - problem.level
-    exact = (problem.statistic(clean).b - problem.gram.apply(attenuation)) * hu
+    exact = (problem.term(clean).b[0] - problem.gram.apply(attenuation)) * hu
     assert torch.allclose(
         found.b - found.apply(volume), exact, atol=1e-4 * float(exact.abs().max())
     )

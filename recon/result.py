@@ -1,4 +1,4 @@
-"""What a method makes of a scan, before :func:`recon.api.reconstruct` makes a volume with a
+"""What a solver or a method makes of a scan; :func:`recon.api.reconstruct` makes a volume with a
 report of it."""
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from torchpcct.metrics.residual_test import ResidualTest  # loads scipy.stats
 
-__all__ = ["RESIDUAL_TEST", "Solution", "tested"]
+__all__ = ["RESIDUAL_TEST", "Result", "tested"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -21,11 +21,12 @@ RESIDUAL_TEST = "the test of what the volume leaves of the readings"
 T = TypeVar("T")
 
 
-class Solution(NamedTuple):
+class Result(NamedTuple):
     """A volume, and what is to be said of it.
 
     Attributes:
-        volume: ``grid.shape`` HU.
+        volume: of a method ``grid.shape`` HU, of a solver ``(..., *grid.shape)`` in the units of
+            its data term.
         report: how it was made.
         warnings: what speaks against it, but for the findings of ``tests``.
         tests: what is left of the data, slice by slice; none of a noise-free scan.
