@@ -1,4 +1,5 @@
-"""Where numba keeps compiled kernels, if it would find no place by itself."""
+"""Where numba keeps compiled kernels, if it would find no place by itself, and where we keep what
+may be computed again."""
 
 from __future__ import annotations
 
@@ -8,9 +9,10 @@ import os
 import shutil
 import sys
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
-__all__ = ["ensure_cache", "is_temporary"]
+__all__ = ["ensure_cache", "is_temporary", "private_folder"]
 
 _TEMPORARY = "torchpcct-kernels-"
 
@@ -63,3 +65,23 @@ def _writable(folder: Path) -> bool:
             return True
     except OSError:
         return False
+
+
+def private_folder(name: str) -> Path | None:
+    """A folder in the user's own cache, made if need be, where nobody else can put a file or a
+    link; None: there is none."""
+    local = os.environ.get("LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME", "")
+    with suppress(OSError, RuntimeError):  # not writable; no home
+        base = Path(local) if os.path.isabs(local) else Path.home() / ".cache"
+        folder = base / "torchpcct" / name
+        for part in (folder.parent, folder):
+            part.mkdir(mode=0o700, parents=True, exist_ok=True)
+            found = part.lstat()
+            # On Windows the profile's own rights keep others out, and these numbers say nothing.
+            mine = not hasattr(os, "getuid") or (
+                found.st_uid == os.getuid() and not found.st_mode & 0o022
+            )
+            if part.is_symlink() or not mine:
+                return None
+        return folder
+    return None

@@ -10,16 +10,17 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 import platform
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+
+from torchpcct.cache_folder import private_folder
 
 __all__ = ["OURS", "announce_compilation", "compiled_once", "folders", "forget_outdated", "sources"]
 
@@ -147,7 +148,7 @@ def compiled_once(patience_s: float = 60.0) -> Iterator[None]:
     def loaded(kernel: Any, *given: Any) -> Any:
         nonlocal left
         found, name = load(kernel, *given), name_of(kernel)
-        folder = None if found is not None or name in held else _lock_folder()
+        folder = None if found is not None or name in held else private_folder("locks")
         if folder is None:
             return found
         lock, start = FileLock(folder / f"{name}.lock"), time.monotonic()
@@ -194,26 +195,3 @@ def compiled_once(patience_s: float = 60.0) -> Iterator[None]:
     finally:
         caches.load_overload, caches.save_overload = load, save
         release_all()
-
-
-def _lock_folder() -> Path | None:
-    """In the user's own cache, made if need be, where nobody else can put a file or a link;
-    None: there is none."""
-    local = os.environ.get("LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME", "")
-    with suppress(OSError, RuntimeError):  # not writable; no home
-        folder = (
-            (Path(local) if os.path.isabs(local) else Path.home() / ".cache")
-            / "torchpcct"
-            / "locks"
-        )
-        for part in (folder.parent, folder):
-            part.mkdir(mode=0o700, parents=True, exist_ok=True)
-            found = part.lstat()
-            # On Windows the profile's own rights keep others out, and these numbers say nothing.
-            mine = not hasattr(os, "getuid") or (
-                found.st_uid == os.getuid() and not found.st_mode & 0o022
-            )
-            if part.is_symlink() or not mine:
-                return None
-        return folder
-    return None

@@ -108,8 +108,9 @@ def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         raise ValueError(
             "--views and --whole are the plaque scan's: put views and region into the configuration"
         )
-    from torchpcct.acquisition.acquire import acquire, plan
+    from torchpcct.acquisition.acquire import acquire, plan, readings_key
     from torchpcct.acquisition.config import read_config
+    from torchpcct.acquisition.kept import ReadingsFolder
     from torchpcct.scene.voxels import VoxelScene
 
     if arguments.config is None:
@@ -137,6 +138,10 @@ def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     options: dict[str, Any] = (
         {} if voxels else {"region": config.region, "tolerance_hu": config.tolerance_hu}
     )
+    if not (voxels or arguments.fresh):
+        options["keep"] = ReadingsFolder(
+            readings_key(config.scene, config.scanner, rotation_s=config.exposure_s, **options)
+        )
     scan = acquire(
         config.scene,
         config.scanner,
@@ -219,6 +224,12 @@ def add_simulate(commands: Commands) -> None:
             {"limits": {"high": MANY}},
         ),
         ("--whole", bool, None, "keep the whole detector, not only the plaque's surroundings"),
+        (
+            "--fresh",
+            bool,
+            None,
+            "compute the expected readings, also where an earlier call with another seed kept them",
+        ),
         *_OUTPUT,
     )
 

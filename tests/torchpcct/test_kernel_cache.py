@@ -18,8 +18,7 @@ from numba.core import caching
 import recon
 import torchpcct
 import train
-from torchpcct import kernel_cache
-from torchpcct.cache_folder import ensure_cache
+from torchpcct.cache_folder import ensure_cache, private_folder
 from torchpcct.kernel_cache import compiled_once, sources
 
 HELPER = """
@@ -216,7 +215,7 @@ def test_without_a_folder_of_ones_own_there_is_no_lock(kernels, tmp_path, monkey
     else:
         monkeypatch.setenv("XDG_CACHE_HOME", "relative")
         monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError("no home")))
-    assert kernel_cache._lock_folder() is None
+    assert private_folder("locks") is None
     if case == "link":
         with compiled_once():
             assert kernels.outer(1) == 4

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchpcct.acquisition.bodies import Bodies
+from torchpcct.acquisition.kept import MOST_BYTES, Known, fingerprint, recall, remember
 from torchpcct.acquisition.plan import Plan, make_plan
 from torchpcct.acquisition.spectra import signal_spectra
 from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, Beam, compress, expected_readings
@@ -28,7 +29,7 @@ from torchpcct.scene.scene import Scene
 from torchpcct.scene.voxels import VoxelScene
 from torchpcct.validate import checked, whole
 
-__all__ = ["acquire", "acquire_voxels", "detected", "plan", "signal_spectra"]
+__all__ = ["acquire", "acquire_voxels", "detected", "plan", "readings_key", "signal_spectra"]
 
 _TOLERANCE = 1e-5
 """Error of a line integral over a metre of body by the number of basis maps."""
@@ -103,7 +104,9 @@ def acquire(
         progress: called with the finished fraction, 0…1.
         keep: called with a name and what computes it for every block of views, returns its
             readings: computed, or those that it kept of an interrupted simulation with the same
-            arguments. None: nothing is kept.
+            arguments. None: they stay in memory, as far as they are small, and another seed or
+            exposure of the same scene costs its noise alone
+            (:func:`torchpcct.acquisition.kept.forget_readings` releases them).
 
     Returns:
         :class:`torchpcct.Scan`; counts float32. Of an energy-integrating detector: signals in keV,
@@ -126,22 +129,36 @@ def acquire(
         clean = acquire_voxels(scene, scanner, progress=progress)
         return clean if exposure_s is None else clean.with_noise(exposure_s, seed)
     start = time.perf_counter()
+    turn_s = exposure_s if rotation_s is None else rotation_s
+    key = readings_key(
+        scene,
+        scanner,
+        region=region,
+        rotation_s=turn_s,
+        duty=duty,
+        tolerance_hu=tolerance_hu,
+        sub_rays=sub_rays,
+    )
+    known = recall(key)
     g = scanner.geometry
-    bodies = Bodies.of(scene, g, exposure_s if rotation_s is None else rotation_s, duty)
-    plan_ = make_plan(bodies, scanner, region, tolerance_hu, sub_rays)
+    bodies = Bodies.of(scene, g, turn_s, duty)
+    if known is None:
+        plan_ = make_plan(bodies, scanner, region, tolerance_hu, sub_rays)
+    else:
+        plan_ = known.plan
     log.info("%s", plan_.table())
     energies, _, air = signal_spectra(scanner)
-    energies_used = energies[plan_.nodes.index]
+    used = energies[plan_.nodes.index]
     beam = Beam(plan_.nodes.spectra, scanner.row_factor, scanner.source.focal_spot, plan_.points)
-    # One view for all: the densest sampling of every effect costs nothing here.
-    dense, one = beam._replace(points=sub_rays_of(SUB_RAY_COUNTS[-1])), g.select([0])
-    symmetric, step = bodies.symmetric(energies_used, one), np.array([bodies.view_step])
-    surround = expected_readings(one, DetectorWindow.full(one), symmetric, dense, step).numpy()[
-        :, 0
-    ]
-    counts = _readings(
-        plan_, bodies, scanner, energies_used, beam, surround, progress, keep or _computed
-    )
+    if known is None:
+        # One view for all: the densest sampling of every effect costs nothing here.
+        dense, one = beam._replace(points=sub_rays_of(SUB_RAY_COUNTS[-1])), g.select([0])
+        symmetric, step = bodies.symmetric(used, one), np.array([bodies.view_step])
+        seen = expected_readings(one, DetectorWindow.full(one), symmetric, dense, step)
+        known = Known(plan_, seen.numpy()[:, 0], {})
+    surround = known.surround
+    counts = _readings(plan_, bodies, scanner, used, beam, known, progress, keep or _computed)
+    remember(key, known)
     info = {
         "scanner": scanner.name,
         "scene": list(scene.names),
@@ -154,6 +171,14 @@ def acquire(
     return scan if exposure_s is None else scan.with_noise(exposure_s, seed)
 
 
+def readings_key(scene: Scene, scanner: Scanner, **options: Any) -> str | None:
+    """Names the expected readings of :func:`acquire` with these arguments: seed and exposure do
+    not belong to them, unless the scene moves and ``rotation_s`` is that of the exposure."""
+    if scene.is_static:
+        options["rotation_s"] = None
+    return fingerprint(scene, scanner, sorted(options.items()))
+
+
 def _computed(_: str, compute: Callable[[], Tensor]) -> Tensor:
     return compute()
 
@@ -164,12 +189,13 @@ def _readings(
     scanner: Scanner,
     energies: Any,
     beam: Beam,
-    surround: Any,
+    known: Known,
     progress: Any,
     keep: Any,
 ) -> Tensor:
-    """Expected readings ``(bins, views, rows, columns)`` of the kept cells, float32."""
-    g, active = scanner.geometry, plan_.active
+    """Expected readings ``(bins, views, rows, columns)`` of the kept cells, float32; those of the
+    varying bodies join what is ``known``."""
+    g, active, surround = scanner.geometry, plan_.active, known.surround
     kept = plan_.kept or DetectorWindow.full(g)
     out = torch.empty((len(surround), *kept.shape), dtype=torch.float32)
     background = torch.from_numpy(surround.astype(np.float32))
@@ -189,7 +215,12 @@ def _readings(
             background[:, None] if plan_.kept is None else kept.select(views).take(background)
         )
         if active is not None:
-            values = keep(f"views_{views.start}-{views.stop}", partial(near, views))
+            name = f"views_{views.start}-{views.stop}"
+            values = known.blocks.get(name)
+            if values is None:
+                values = keep(name, partial(near, views))
+                if known.bytes + values.nbytes <= MOST_BYTES:
+                    known.blocks[name] = values
             rows = slice(
                 active.first_row - kept.first_row, active.first_row - kept.first_row + active.rows
             )
