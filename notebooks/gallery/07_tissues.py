@@ -7,7 +7,7 @@ What is known of a vessel if its tissues, and not voxels, are the unknowns?
 import matplotlib.pyplot as plt
 
 from recon.least_squares.inset_problem import InsetProblem
-from recon.vessel import TissueData, read_plaque
+from recon.vessel import read_plaque
 from torchpcct import VolumeGrid, acquire
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene
@@ -18,7 +18,7 @@ scan = acquire(
     scene, presets.pcct(views=492, rows=32), exposure_s=2.0, seed=0, region=inset, duty=1 / 4
 )
 # blind; or a point that a reader gives
-reading = read_plaque(TissueData.of_scan(scan, InsetProblem(scan, inset)))
+reading = read_plaque(InsetProblem(scan, inset).term(scan))
 fig, axes = plt.subplots(1, 2, figsize=(7.5, 3.4), layout="constrained")
 shown = axes[0].imshow(
     reading.image[18], cmap="gray", vmin=-150, vmax=450, extent=(-4.5, 4.5) * 2, origin="lower"

@@ -27,7 +27,6 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     check_results(arguments, folder, lambda report: "presence" in report, *names)
     from recon import reconstruct
     from recon.least_squares.inset_problem import InsetProblem
-    from recon.vessel.data import TissueData
     from recon.vessel.fbp_noise import fbp_deviations
     from recon.vessel.prior import VesselPrior
     from recon.vessel.reading import read_plaque
@@ -52,10 +51,10 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         require_within(arguments.point, grid)
     start = time.perf_counter()
     problem = InsetProblem(scan, grid)
-    data = TissueData.of_scan(scan, problem)
+    term = problem.term(scan)
     made = time.perf_counter()
     reading = read_plaque(
-        data,
+        term,
         arguments.point,
         point_sd=arguments.point_sd,
         particles=arguments.particles,

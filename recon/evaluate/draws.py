@@ -255,10 +255,12 @@ class Simulated:
     def mbir(self, network: Mbir) -> Tensor:
         """HU ``(z, y, x)``, as :func:`recon.reconstruct` gives it."""
         with torch.no_grad():
-            found = network.solved(self.term)
-        note = found.notes[0]
-        self.drawn, self.warned = note.get("vessel", {}).get("drawn"), bool(note.get("warnings"))
-        return found.normal.hu(found.u)[0]
+            (found,) = network.solve(self.term)
+        self.drawn, self.warned = (
+            found.report.get("vessel", {}).get("drawn"),
+            bool(found.warnings),
+        )
+        return found.volume
 
     def sigma(self, method: Method, smooths: float = 0.0) -> float:
         """Noise in HU of a linear method at this exposure in the largest tissue."""

@@ -40,11 +40,11 @@ from recon.least_squares.field_model import FieldModel
 from recon.least_squares.field_problem import FieldProblem, field_prior
 from recon.least_squares.memory import require_memory
 from recon.least_squares.pwls import pwls
-from recon.mbir.mbir import Mbir, Reconstructed, average_onto
+from recon.mbir.mbir import Mbir, average_onto
 from recon.mbir.network import REFERENCE_SCALE_HU
 from recon.mbir.priors import Prior, same_kind
 from recon.mbir.unrolled import bound
-from recon.result import RESIDUAL_TEST, tested
+from recon.result import RESIDUAL_TEST, Result, tested
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.volume import to_hu
@@ -52,7 +52,7 @@ from torchpcct.volume import to_hu
 if TYPE_CHECKING:
     from torchpcct.metrics.residual_test import ResidualTest  # loads scipy.stats
 
-__all__ = ["Field", "FieldGram", "FieldScan", "blockwise", "trained_grid"]
+__all__ = ["Field", "FieldGram", "blockwise", "trained_grid"]
 
 VOXELS_PER_CELL = (0.7, 1.5)
 """Voxel over detector cell at the axis: the training has 0.2 mm voxels on cells of 0.2 mm × 0.29
@@ -263,13 +263,13 @@ class Field:
         flat = len(scan.geometry.shape) == 2
         self._asked = grid.slice if flat and grid.ndim == 3 else grid
         self._work = trained_grid(self._asked, scan.geometry)
-        self.voxel_mm = network.voxel_mm
-        fine, self.cell_mm = grid.spacing[-1], self._work.spacing[-1]
-        if self.cell_mm > 1.01 * fine:
+        self.network = network
+        fine, cell = grid.spacing[-1], self._work.spacing[-1]
+        if cell > 1.01 * fine:
             raise ValueError(
                 f"voxels of {fine:g} mm are finer than what the network was trained for on this "
-                f"detector, whose cells have {self.cell_mm:g} mm at the axis: ask for voxels of "
-                f'{self.cell_mm:g} mm or more and resample the result, or use method="pwls"'
+                f"detector, whose cells have {cell:g} mm at the axis: ask for voxels of "
+                f'{cell:g} mm or more and resample the result, or use method="pwls"'
             )
         full = self._work
         if self._asked is not grid:
@@ -279,117 +279,94 @@ class Field:
                 (grid.center[0], *self._work.center),
             )
         self.problem = FieldProblem(scan, full)
-        self.warnings = self.problem.warnings
 
-    def scans(self, scans: Sequence[Scan]) -> FieldScan:
-        """What is asked of one scan."""
+    def solve(self, scans: Sequence[Scan]) -> list[Result]:
+        """The volume of one scan in HU, on the grid that was asked for.
+
+        Raises:
+            ValueError: too little memory.
+        """
         (scan,) = scans
-        return FieldScan(self, scan)
-
-    def onto_grid(self, hu: Tensor) -> Tensor:
-        """A volume of the grid that is worked on, on the one that was asked for."""
-        return hu if self._work is self._asked else _onto(hu, self._work, self._asked)
-
-
-class FieldScan:
-    """What :func:`recon.mbir.reconstruct.reconstruct_mbir` asks of a scan of a whole field; see
-    :class:`recon.mbir.inset.InsetScans`, which says the same of scans of an inset.
-
-    Args:
-        field: of the scan.
-        scan: the scan.
-
-    Raises:
-        ValueError: too little memory.
-    """
-
-    def __init__(self, field: Field, scan: Scan) -> None:
-        self._field, self._problem = field, field.problem
-        self._slices = self._problem.slices(scan)
-        A = self._problem.projector
-        require_memory(A, 1, self._slices[0][0], None)
-        self._gram = FieldGram(self._problem, [w for _, w in self._slices], field.voxel_mm)
-        self._around = _surround(self._problem, self._slices)
-        rest = [y - A(x) for (y, _), x in zip(self._slices, self._around, strict=True)]
-        weighed = [w * v for (_, w), v in zip(self._slices, rest, strict=True)]
-        energy = sum((w * v).sum(dtype=torch.float64) for w, v in zip(weighed, rest, strict=True))
-        b = self._gram.ratio * self._stacked([A.T(v) for v in weighed])
-        self.term = Quadratic(
-            self._gram,
-            b[None],
-            torch.ones(1),
-            (field.voxel_mm,) * 3,
-            self._problem.mu_ref,
-            energy=torch.as_tensor(energy)[None],
-            readings=sum(int((w > 0).sum()) for _, w in self._slices),
-        )
-
-    def _stacked(self, volumes: Sequence[Tensor]) -> Tensor:
-        """``(z, y, x)`` of the volumes of all slices."""
-        return torch.stack(list(volumes)) if self._problem.plane else volumes[0]
-
-    def solved(self, network: Mbir) -> Reconstructed:
-        """The volume in noise units, whose scale changes over the field."""
-        normal = network.normal(self.term)
-        # Its noise is known on average over directions only: along a starved one, noise would pass
-        # for structure, so nothing is put back.
-        prior = bound(network.prior, normal, normal.spectrum())
-        u = network.with_prior(partial(blockwise, prior, self._scales(normal))).solution(
-            normal, restore=False, solves=SOLVES
-        )
-        return Reconstructed(normal, u, [{}], [False])
-
-    def _scales(self, normal: Quadratic) -> Tensor:
-        """Noise scale of each voxel, ``(z, y, x)`` HU."""
-        return normal.unit_hu * self._gram.ratio
-
-    def whole(self, normal: Quadratic) -> Quadratic:
-        """The data term before the edges were taken off."""
-        around = self._stacked(self._around)[None]
-        return normal.less(-around / (self._scales(normal) * normal.mu_per_hu))
-
-    def _mm(self, solved: Reconstructed) -> list[Tensor]:
-        """Of each slice in mm⁻¹."""
-        normal, u = solved.normal, solved.u
-        rest = (u[0] * self._scales(normal)) * normal.mu_per_hu
-        parts = rest if self._problem.plane else [rest]
-        return [x + d for x, d in zip(self._around, parts, strict=True)]
-
-    def volumes(self, solved: Reconstructed) -> Tensor:
-        """HU ``(1, *grid.shape)`` on the grid that is worked on."""
-        return self._problem.hu(self._mm(solved))[None]
-
-    def noise_scale_hu(self, k: int, normal: Quadratic) -> tuple[float, float]:
-        """10 and 90 % of the voxels."""
-        seen = self._scales(normal)[self._gram.determined]
+        problem, network = self.problem, self.network
+        slices = problem.slices(scan)
+        require_memory(problem.projector, 1, slices[0][0], None)
+        with torch.no_grad():
+            gram = FieldGram(problem, [w for _, w in slices], network.voxel_mm)
+            around = _surround(problem, slices)
+            normal = network.normal(_term(problem, slices, gram, around, network.voxel_mm))
+            scales = normal.unit_hu * gram.ratio
+            # Its noise is known on average over directions only: along a starved one, noise would
+            # pass for structure, so nothing is put back.
+            prior = bound(network.prior, normal, normal.spectrum())
+            u = network.with_prior(partial(blockwise, prior, scales)).solution(
+                normal, restore=False, solves=SOLVES
+            )
+            taken = _stacked(problem, around)[None] / (scales * normal.mu_per_hu)
+            rest = (u[0] * scales) * normal.mu_per_hu
+            parts = rest if problem.plane else [rest]
+            mu = [x + d for x, d in zip(around, parts, strict=True)]
+            volume, report, _, _ = network.results(
+                normal, u, problem.hu(mu)[None], whole=normal.less(-taken)
+            )[0]
+        seen = scales[gram.determined]
         seen = seen[:: max(1, seen.numel() // 10**6)]
         low, high = (float(q) for q in torch.quantile(seen, seen.new_tensor([0.1, 0.9])))
-        return low, high
+        report |= {"noise_scale_hu": (low, high), "voxel_mm": self._work.spacing[-1]}
+        peak = float(to_hu(_stacked(problem, mu)[gram.determined].max(), problem.mu_ref))
+        warnings = [*problem.warnings, *self._strange(len(slices), (low, high))]
+        warnings += network.check((low, high), peak, problem.unit, problem.mu_ref)
+        tests: list[ResidualTest] = []
+        if not scan.noise_free:
+            for (y, w), x in zip(slices, mu, strict=True):
+                tests += tested(RESIDUAL_TEST, warnings, problem.residual_test, y, w, x)
+        if self._work is not self._asked:
+            volume = _onto(volume, self._work, self._asked)
+        return [Result(volume, report, warnings, tests)]
 
-    def peak_hu(self, k: int, solved: Reconstructed) -> float:
-        """The largest value where the data determine any."""
-        found = self._stacked(self._mm(solved))[self._gram.determined]
-        return float(to_hu(found.max(), self._problem.mu_ref))
-
-    def doubts(self, network: Mbir, scales: tuple[float, float]) -> list[str]:
+    def _strange(self, slices: int, scales: tuple[float, float]) -> list[str]:
         """What the network was not trained for."""
         strange = []
-        if self._problem.plane and len(self._slices) == 1:
+        if self.problem.plane and slices == 1:
             strange.append("a single slice, without neighbours along z")
-        if self._problem.unit != "HU":
-            strange.append(f"values in {self._problem.unit}, not a patient in HU")
-        if network.noisier_or_quieter(scales):
+        if self.problem.unit != "HU":
+            strange.append(f"values in {self.problem.unit}, not a patient in HU")
+        if self.network.noisier_or_quieter(scales):
             strange.append("another noise than that of its scans")
         if not strange:
             return []
         return [f'the network was not trained for this ({"; ".join(strange)}): use method="pwls"']
 
-    def tests(self, k: int, solved: Reconstructed, failed: list[str]) -> list[ResidualTest]:
-        """Of what is left of each slice."""
-        found: list[ResidualTest] = []
-        for (y, w), x in zip(self._slices, self._mm(solved), strict=True):
-            found += tested(RESIDUAL_TEST, failed, self._problem.residual_test, y, w, x)
-        return found
+
+def _term(
+    problem: FieldProblem,
+    slices: Sequence[tuple[Tensor, Tensor]],
+    gram: FieldGram,
+    around: Sequence[Tensor],
+    voxel_mm: float,
+) -> Quadratic:
+    """The data term of what is to be added to the edges, for volumes that are divided by s."""
+    A = problem.projector
+    rest = [y - A(x) for (y, _), x in zip(slices, around, strict=True)]
+    weighed = [w * v for (_, w), v in zip(slices, rest, strict=True)]
+    energy = torch.stack(
+        [(w * v).sum(dtype=torch.float64) for w, v in zip(weighed, rest, strict=True)]
+    ).sum()
+    b = gram.ratio * _stacked(problem, [A.T(v) for v in weighed])
+    readings = sum(int((w > 0).sum()) for _, w in slices)
+    return Quadratic(
+        gram,
+        b[None],
+        torch.ones(1),
+        (voxel_mm,) * 3,
+        problem.mu_ref,
+        energy=energy[None],
+        readings=readings,
+    )
+
+
+def _stacked(problem: FieldProblem, volumes: Sequence[Tensor]) -> Tensor:
+    """``(z, y, x)`` of the volumes of all slices."""
+    return torch.stack(list(volumes)) if problem.plane else volumes[0]
 
 
 def _onto(hu: Tensor, source: VolumeGrid, target: VolumeGrid) -> Tensor:

@@ -5,22 +5,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from recon.data_term import Quadratic
 from recon.least_squares.inset_problem import InsetProblem
 from recon.least_squares.surround import CELL_MM, length_unit
-from recon.mbir.mbir import Mbir, Reconstructed, average_onto, working_grid
-from recon.result import RESIDUAL_TEST, tested
+from recon.mbir.mbir import Mbir, average_onto, working_grid
+from recon.result import RESIDUAL_TEST, Result, tested
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 
-if TYPE_CHECKING:
-    from torchpcct.metrics.residual_test import ResidualTest  # loads scipy.stats
-
-__all__ = ["Inset", "InsetScans"]
+__all__ = ["Inset"]
 
 FARTHEST_CELL = 4.0
 """Detector cells at the axis may be so many times as large, or as small, as the network's
@@ -35,93 +32,65 @@ class Inset:
         grid: of the inset.
         network: with its weights.
         problem: of the scan on :func:`recon.mbir.mbir.working_grid`; None: made here.
+        noise_map: whether reports hold ``noise_sd_hu``.
 
     Raises:
-        ValueError: see :class:`recon.least_squares.inset_problem.InsetProblem`; a scanner whose
-            cells have another size than the network's voxels by far; a problem that was made for
-            another grid.
+        ValueError: see :class:`recon.least_squares.inset_problem.InsetProblem`; a grid that is no
+            inset; a scanner whose cells have another size than the network's voxels by far; a
+            problem that was made for another grid.
     """
 
     def __init__(
-        self, scan: Scan, grid: VolumeGrid, network: Mbir, problem: InsetProblem | None = None
+        self,
+        scan: Scan,
+        grid: VolumeGrid,
+        network: Mbir,
+        problem: InsetProblem | None = None,
+        noise_map: bool = False,
     ) -> None:
         _check_cells(scan, network.voxel_mm)
+        self.network, self.noise_map = network, noise_map
         self._asked, self._work = grid, working_grid(grid, network.voxel_mm)
-        self.cell_mm = self._work.spacing[-1]
         self.problem = problem or InsetProblem(scan, self._work)
         if self.problem.grid != self._work:
             raise ValueError(
                 f"the problem was made for another grid: make it on {self._work} "
                 "(recon.mbir.working_grid)"
             )
-        self.warnings: list[str] = []
 
-    def scans(self, scans: Sequence[Scan]) -> InsetScans:
-        """What is asked of some scans."""
-        return InsetScans(self.problem, scans)
+    def solve(self, scans: Sequence[Scan]) -> list[Result]:
+        """Volumes in HU on the grid that was asked for."""
+        network, problem = self.network, self.problem
+        data = [problem.data(s) for s in scans]
+        terms = [problem.term(s, y) for s, y in zip(scans, data, strict=True)]
+        term = replace(Quadratic.joined(terms), operator=problem.gram)
+        with torch.no_grad():
+            solved = network.solve(term)
+        found = []
+        for k, (scan, y, (volume, report, said, _)) in enumerate(
+            zip(scans, data, solved, strict=True)
+        ):
+            report["voxel_mm"] = self._work.spacing[-1]
+            peak = float(volume.max())
+            warnings = [
+                *said,
+                *network.check(report["noise_scale_hu"], peak, scan.unit, problem.mu_ref),
+            ]
+            tests = []
+            if not scan.noise_free:
+                tests = tested(RESIDUAL_TEST, warnings, problem.residual_test, scan, volume, y)
+            if network.known is not None and report[network.known.name]["drawn"]:
+                with torch.no_grad():
+                    plain = network.with_known(None)(term.part([k]))[0]
+                report["drawn_minus_plain_hu"] = self._onto_grid(volume - plain)
+            if self.noise_map:
+                report["noise_sd_hu"] = self._onto_grid(network.noise_map(term.part([k])))
+            found.append(Result(self._onto_grid(volume), report, warnings, tests))
+        return found
 
-    def onto_grid(self, hu: Tensor) -> Tensor:
+    def _onto_grid(self, hu: Tensor) -> Tensor:
         """A volume of the grid that is worked on, on the one that was asked for."""
         return hu if self._work is self._asked else average_onto(hu, self._work, self._asked)
-
-
-class InsetScans:
-    """What :func:`recon.mbir.reconstruct.reconstruct_mbir` asks of scans of an inset.
-
-    Args:
-        problem: of the scans.
-        scans: any of them.
-
-    Attributes:
-        term: of all of them, in mm⁻¹.
-
-    Raises:
-        ValueError: the grid is no inset: PWLS alone can do without its FFT model.
-    """
-
-    def __init__(self, problem: InsetProblem, scans: Sequence[Scan]) -> None:
-        self._problem, self._scans = problem, list(scans)
-        self._data = [problem.data(s) for s in scans]
-        terms = [problem.term(s, y) for s, y in zip(scans, self._data, strict=True)]
-        self.term = replace(Quadratic.joined(terms), operator=problem.gram)
-
-    def solved(self, network: Mbir) -> Reconstructed:
-        """Volumes in noise units."""
-        return network.solved(self.term)
-
-    def whole(self, normal: Quadratic) -> Quadratic:
-        """The data term before anything was taken off that the volume shows: itself."""
-        return normal
-
-    def volumes(self, solved: Reconstructed) -> Tensor:
-        """HU ``(batch, z, y, x)`` on the grid that is worked on."""
-        return solved.normal.hu(solved.u)
-
-    def noise_scale_hu(self, k: int, normal: Quadratic) -> tuple[float, float]:
-        """The least and the largest of the grid: one."""
-        scale = float(normal.unit_hu[k])
-        return scale, scale
-
-    def peak_hu(self, k: int, solved: Reconstructed) -> float:
-        """The largest value."""
-        return float(self.volumes(solved)[k].max())
-
-    def doubts(self, network: Mbir, scales: tuple[float, float]) -> list[str]:
-        """What the network was not trained for, beside :meth:`recon.mbir.mbir.Mbir.check`: insets
-        it was."""
-        return []
-
-    def tests(self, k: int, solved: Reconstructed, failed: list[str]) -> list[ResidualTest]:
-        """Of what is left of a scan's data."""
-        volume = self.volumes(solved)[k]
-        return tested(
-            RESIDUAL_TEST,
-            failed,
-            self._problem.residual_test,
-            self._scans[k],
-            volume,
-            self._data[k],
-        )
 
 
 def _check_cells(scan: Scan, voxel_mm: float) -> None:

@@ -1,5 +1,4 @@
-"""Model-based reconstruction with the learned prior: from the scan's statistic AᵀW y to a volume in
-HU.
+"""Model-based reconstruction with the learned prior: from a scan's data term to a volume in HU.
 
 The network works on cubic voxels of one size (the one it was trained at); other grids are
 reconstructed on such voxels over the same extent and averaged onto the grid that was asked for.
@@ -12,11 +11,11 @@ import copy
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -26,13 +25,14 @@ from recon.data_term import Quadratic
 from recon.mbir.known import Drawn, Known
 from recon.mbir.network import Network
 from recon.mbir.priors import Prior, name_of, network_of, prior_of
-from recon.mbir.unrolled import DEFAULT_FIDELITY, Unrolled, fidelity_frequency
+from recon.mbir.unrolled import DEFAULT_FIDELITY, Unrolled, fidelity_frequency, low_residual
 from recon.mbir.weights_io import digest, read_tensors
+from recon.result import Result
 from torchpcct.geometry import VolumeGrid
 from torchpcct.switches import undisturbed
 from torchpcct.volume import in_words
 
-__all__ = ["Mbir", "Reconstructed", "average_onto", "overlap", "working_grid"]
+__all__ = ["Mbir", "average_onto", "overlap", "working_grid"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -40,24 +40,6 @@ SHIPPED = "mbir.safetensors"
 WEIGHTS_FORMAT = "torchpcct unrolled weights 2"
 LARGEST_HU = 2000.0
 """Above the densest calcification of the training, 1800 HU: what reads more is metal."""
-
-
-@dataclass(frozen=True)
-class Reconstructed:
-    """Reconstructions of a batch.
-
-    Attributes:
-        normal: the normalised problem.
-        u: ``(batch, z, y, x)`` in its units.
-        notes: for each volume, what its report shall hold beside; under ``warnings`` a list of
-            texts.
-        drawn: for each volume, whether something known was drawn (:mod:`recon.mbir.known`).
-    """
-
-    normal: Quadratic
-    u: Tensor
-    notes: list[dict[str, Any]]
-    drawn: list[bool]
 
 
 class Mbir:
@@ -194,19 +176,62 @@ class Mbir:
             term: of scans, in mm⁻¹ on voxels of ``voxel_mm``
                 (:meth:`recon.least_squares.inset_problem.InsetProblem.term`).
         """
-        found = self.solved(term)
-        return found.normal.hu(found.u)
+        normal = self.normal(term)
+        return normal.hu(self._solved(term, normal)[0])
 
     @undisturbed
-    def solved(self, term: Quadratic) -> Reconstructed:
-        """The same with what it was made of; with something known, what was drawn or why not."""
+    def solve(self, term: Quadratic) -> list[Result]:
+        """Volumes in HU with their reports (:meth:`results`), the units of ``term`` as above. With
+        something known, reports and warnings say what was drawn, or why not."""
         normal = self.normal(term)
+        u, notes = self._solved(term, normal)
+        return [
+            found._replace(report=found.report | note.report, warnings=note.warnings)
+            for found, note in zip(self.results(normal, u, normal.hu(u)), notes, strict=True)
+        ]
+
+    @torch.no_grad()
+    def results(
+        self, normal: Quadratic, u: Tensor, volumes: Tensor, whole: Quadratic | None = None
+    ) -> list[Result]:
+        """Volumes with their reports: ``method``, ``iterations``, ``fidelity``, ``residual``
+        (:func:`recon.mbir.unrolled.low_residual`), ``chi2`` where yᵀW y is known,
+        ``noise_scale_hu`` (least and largest), and the weights or the prior.
+
+        Args:
+            normal: the data term in noise units.
+            u: the volumes in these units.
+            volumes: the same as they are given back.
+            whole: the data term before something was taken off that the volumes show; None:
+                ``normal``.
+        """
+        left = normal.left(u)
+        residual = low_residual(whole or normal, left, self.fidelity).tolist()
+        chi2 = [None] * len(u) if normal.energy is None else normal.chi2(u, left).tolist()
+        same = {"method": "mbir", "iterations": self.model.steps, "fidelity": self.fidelity}
+        return [
+            Result(
+                volume,
+                {
+                    **same,
+                    "residual": residual[k],
+                    "chi2": chi2[k],
+                    "noise_scale_hu": (float(normal.unit_hu[k]),) * 2,
+                    **self.made_with,
+                },
+            )
+            for k, volume in enumerate(volumes)
+        ]
+
+    def _solved(self, term: Quadratic, normal: Quadratic) -> tuple[Tensor, list[_Note]]:
+        """u of a batch, and what is to be said of each volume."""
         if self.known is not None:
             return self._around(self.known, term, normal)
-        n = len(term.b)
-        return Reconstructed(normal, self.solution(normal), [{} for _ in range(n)], [False] * n)
+        return self.solution(normal), [_Note({}, [])] * len(term.b)
 
-    def _around(self, known: Known, term: Quadratic, normal: Quadratic) -> Reconstructed:
+    def _around(
+        self, known: Known, term: Quadratic, normal: Quadratic
+    ) -> tuple[Tensor, list[_Note]]:
         """Around what is known; where nothing is drawn, or what is drawn is objected to, without
         it."""
         scans = range(len(term.b))
@@ -232,9 +257,8 @@ class Mbir:
         plain = [k for k in scans if k not in volumes]
         if plain:
             volumes |= dict(zip(plain, self.solution(normal.part(plain)), strict=True))
-        u = torch.stack([volumes[k] for k in scans])
         notes = [_note(known, *one) for one in zip(found, why, strict=True)]
-        return Reconstructed(normal, u, notes, [k not in plain for k in scans])
+        return torch.stack([volumes[k] for k in scans]), notes
 
     def solution(self, normal: Quadratic, **parts: Any) -> Tensor:
         """u of a normalised problem, ``(batch, z, y, x)``.
@@ -382,11 +406,18 @@ def _ready(given: Prior | str) -> Prior:
     return prior.eval() if isinstance(prior, nn.Module) else prior
 
 
-def _note(known: Known, found: Drawn, why: str) -> dict[str, Any]:
-    """What the report says of a scan in which something known was to be drawn."""
+class _Note(NamedTuple):
+    """What report and warnings of a volume hold beside."""
+
+    report: dict[str, Any]
+    warnings: list[str]
+
+
+def _note(known: Known, found: Drawn, why: str) -> _Note:
+    """What is to be said of a scan in which something known was to be drawn."""
     said = {"drawn": False, "why": why} if why else {"drawn": True}
     text = f"no {known.name} was drawn: {why}" if why else known.caution
-    return {**found.report, known.name: said, "warnings": [*found.warnings, text]}
+    return _Note({**found.report, known.name: said}, [*found.warnings, text])
 
 
 def _fill(model: Unrolled, tensors: Mapping[str, Tensor]) -> None:

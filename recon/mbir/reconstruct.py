@@ -1,11 +1,10 @@
-"""MBIR of a scan: of an inset here, of a whole field in :mod:`recon.mbir.field`."""
+"""MBIR of scans, of an inset (:mod:`recon.mbir.inset`) or a whole field
+(:mod:`recon.mbir.field`)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
-
-import torch
 
 from recon.least_squares.field_problem import is_whole_field
 from recon.least_squares.inset_problem import InsetProblem
@@ -13,7 +12,6 @@ from recon.mbir.field import Field
 from recon.mbir.inset import Inset
 from recon.mbir.known import Known
 from recon.mbir.mbir import Mbir
-from recon.mbir.unrolled import low_residual
 from recon.result import Result
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
@@ -46,7 +44,7 @@ def reconstruct_mbir(
             or a name such as ``perona-malik`` or ``package.module:function``
             (:func:`recon.mbir.priors.prior_of`).
         problem: kept from an earlier call with the same scan and (working) grid; None: made here.
-        batch: volumes at a time.
+        batch: volumes of an inset at a time; of a whole field it is one.
         fidelity: from 0 (quiet images for viewing) to 1 (for measuring: more of the contrast and
             more noise), see :mod:`recon.mbir.unrolled`; None: that of ``network``, which is 0.5
             unless it was loaded with another.
@@ -59,8 +57,10 @@ def reconstruct_mbir(
             left of the data at
         the low frequencies that are the data's own, over what there was,
         :func:`recon.mbir.unrolled.low_residual`), ``chi2`` (weighted squared residual per reading),
-        ``weights_sha256`` or the name of the ``prior``, of noisy scans ``residual_p``
-        (:mod:`torchpcct.metrics.residual_test`: does the volume explain its data?), ``warnings``;
+        ``noise_scale_hu`` (of a whole field where 10 and 90 % of the voxels lie), ``voxel_mm`` (of
+        the grid that is worked on), ``weights_sha256`` or the name of the ``prior``, of noisy scans
+        ``residual_p`` (:mod:`torchpcct.metrics.residual_test`: does the volume explain its data?),
+        ``warnings``;
         with something ``known``, under its name, whether it was drawn (``drawn``) or ``why`` not,
         and where it was, ``drawn_minus_plain_hu``, the difference from the volume without drawing,
         like the volume in HU.
@@ -90,42 +90,7 @@ def reconstruct_mbir(
         domain: Field | Inset = Field(scans[0], grid, network)
         batch = 1
     else:
-        domain = Inset(scans[0], grid, network, problem)
+        domain = Inset(scans[0], grid, network, problem, noise_map)
     for i in range(0, len(scans), batch):
-        part = scans[i : i + batch]
-        seen = domain.scans(part)
-        with torch.no_grad():
-            solved = seen.solved(network)
-            normal, left = solved.normal, solved.normal.left(solved.u)
-            residual = low_residual(seen.whole(normal), left, network.fidelity).tolist()
-            chi2 = normal.chi2(solved.u, left).tolist()
-            volumes = seen.volumes(solved)
-        found = []
-        for k, (scan, volume) in enumerate(zip(part, volumes, strict=True)):
-            scales = seen.noise_scale_hu(k, normal)
-            report: dict[str, Any] = {
-                "method": "mbir",
-                "iterations": network.model.steps,
-                "fidelity": network.fidelity,
-                "residual": residual[k],
-                "chi2": chi2[k],
-                "noise_scale_hu": scales,
-                "voxel_mm": domain.cell_mm,
-                **network.made_with,
-                **solved.notes[k],
-            }
-            warnings = [*domain.warnings, *report.pop("warnings", [])]
-            warnings += seen.doubts(network, scales)
-            peak = seen.peak_hu(k, solved)
-            warnings += network.check(scales, peak, scan.unit, scan.linearisation.mu_ref)
-            tests = [] if scan.noise_free else seen.tests(k, solved, warnings)
-            if solved.drawn[k]:
-                with torch.no_grad():
-                    changed = volume - network.with_known(None)(seen.term.part([k]))[0]
-                report["drawn_minus_plain_hu"] = domain.onto_grid(changed)
-            if noise_map:
-                sd = network.noise_map(seen.term.part([k]))
-                report["noise_sd_hu"] = domain.onto_grid(sd)
-            found.append(Result(domain.onto_grid(volume), report, warnings, tests))
-        yield found
+        yield domain.solve(scans[i : i + batch])
         progress(min(i + batch, len(scans)) / len(scans))

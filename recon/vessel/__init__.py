@@ -7,7 +7,7 @@ then an average over all of the tissue instead of over a small ROI, and its unce
 of the outlines.
 
 :mod:`~recon.vessel.reading` does all of it (:func:`~recon.vessel.reading.read_plaque`). Below it,
-in the order of the data: :mod:`~recon.vessel.data` (statistic and operator of a scan),
+in the order of the data: :mod:`~recon.vessel.data` (the data term in HU),
 :mod:`~recon.vessel.start` and :mod:`~recon.vessel.centreline` (where the vessel is),
 :mod:`~recon.vessel.prior`, :mod:`~recon.vessel.outline` and :mod:`~recon.vessel.model` (its model
 and fit), :mod:`~recon.vessel.core` and :mod:`~recon.vessel.particles` (plaque bodies),
@@ -19,9 +19,8 @@ and fit), :mod:`~recon.vessel.core` and :mod:`~recon.vessel.particles` (plaque b
 reconstruct the rest around.
 """
 
-from recon.vessel.data import TissueData
 from recon.vessel.figures import Estimate
 from recon.vessel.prior import VesselPrior
 from recon.vessel.reading import PlaqueReading, read_plaque
 
-__all__ = ["Estimate", "PlaqueReading", "TissueData", "VesselPrior", "read_plaque"]
+__all__ = ["Estimate", "PlaqueReading", "VesselPrior", "read_plaque"]

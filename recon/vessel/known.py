@@ -47,7 +47,7 @@ from torch import Tensor
 from recon.data_term import Quadratic
 from recon.mbir.known import Drawn, Known
 from recon.mbir.unrolled import DEFAULT_FIDELITY
-from recon.vessel.data import TissueData
+from recon.vessel.data import grid_of, in_hu, pilot
 from recon.vessel.layer import SD_HU, LayerEstimate
 from recon.vessel.model import FAT, FIBROUS, WALL, Fit, Vessel
 from recon.vessel.prior import VesselPrior
@@ -135,12 +135,12 @@ class KnownVessel:
 
     def drawn(self, term: Quadratic, fidelity: float) -> Drawn:
         """See :meth:`recon.mbir.known.Known.drawn`."""
-        b, data = term.b[0], TissueData.of_term(term)
+        b, data = term.b[0], in_hu(term)
         try:
             # Many small matrices: BLAS threads would wait for each other.
             with threadpool_limits(limits=1, user_api="blas"):
                 prior = self.vessel_prior or VesselPrior(shift=_SHIFT_HU)
-                vessel = Vessel(data, find_vessel(data.pilot(), data.grid, None), prior)
+                vessel = Vessel(data, find_vessel(pilot(data), grid_of(data), None), prior)
                 estimate = LayerEstimate(
                     vessel.fit(vessel.first_guess(), expected=True), layer_sd_hu(fidelity)
                 )
@@ -156,7 +156,7 @@ class KnownVessel:
         def objection(volume: Tensor) -> str:
             # The drawing knows fibrous tissue alone in the layer, and fat alone around: there the
             # network is believed.
-            there = data.apply(others * (volume - outlines))
+            there = data.apply((others * (volume - outlines))[None])[0]
             highest = float(np.abs(scores_of(vessel, fit, there)).max())
             if highest <= STRIKING:
                 return ""
@@ -189,8 +189,7 @@ class KnownTissues(KnownVessel):
         why not."""
         outlines = super().drawn
         try:
-            data = TissueData.of_term(term)
-            reading = read_plaque(data, self.point, vessel_prior=self.vessel_prior)
+            reading = read_plaque(term, self.point, vessel_prior=self.vessel_prior)
         except ValueError as error:
             why = f"no tissues were fitted: {error}"
             return _without(outlines(term, fidelity), why)

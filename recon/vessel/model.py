@@ -26,8 +26,9 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import ndtr
 
+from recon.data_term import Quadratic
 from recon.vessel.centreline import Centreline, Coordinates
-from recon.vessel.data import TissueData
+from recon.vessel.data import grid_of
 from recon.vessel.kernels import sharpened
 from recon.vessel.local_gram import LocalGram
 from recon.vessel.outline import Outline, OutlineAt
@@ -220,13 +221,13 @@ class Vessel:
     """The model of one vessel and its data.
 
     Args:
-        data: statistic and operator.
+        data: in HU (:func:`recon.vessel.data.in_hu`).
         start: where the vessel is.
         prior: of tissue values and outlines.
     """
 
-    def __init__(self, data: TissueData, start: Start, prior: VesselPrior | None = None) -> None:
-        grid = self.grid = data.grid
+    def __init__(self, data: Quadratic, start: Start, prior: VesselPrior | None = None) -> None:
+        grid = self.grid = grid_of(data)
         self.data, self.start, self.prior = data, start, prior or VesselPrior()
         low = max(start.ends[0], -1.0) - 1.0
         high = min(start.ends[1], start.lumen.length + 1.0) + 1.0
@@ -261,11 +262,11 @@ class Vessel:
         self._planes = np.stack(
             [np.ones(len(flat)), c.rho * np.cos(c.theta), c.rho * np.sin(c.theta)], 1
         )
-        self.gram = LocalGram.of(data.gram, self.index, data.scale)
-        ones = data.apply(torch.ones(grid.shape)).double()
+        self.gram = LocalGram.of(data.operator, self.index, float(data.scale))
+        ones = data.apply(torch.ones(1, *grid.shape))[0].double()
         self.ones = ones.numpy()[tuple(self.index.T)]
         self.ones_energy = float(ones.sum())
-        self.b = data.b.double().numpy()[tuple(self.index.T)]
+        self.b = data.b[0].double().numpy()[tuple(self.index.T)]
         self.b_sum = float(data.b.double().sum())
         self._radius = float(np.median(start.radii[1][1]))
         self._prior_mean, self._prior = self._prior_of()

@@ -15,7 +15,9 @@ from scipy import ndimage
 from scipy.stats import norm
 from torch import Tensor
 
-from recon.vessel.data import TissueData
+from recon.data_term import Quadratic
+from recon.vessel.data import least_squares, pilot
+from recon.vessel.data import scores as scores_in
 from recon.vessel.model import FAT, FIBROUS, Fit, Vessel
 
 __all__ = ["Leftover", "Texture", "beside", "leftover", "misfit", "scores_of", "texture"]
@@ -93,16 +95,16 @@ def _between_ends(vessel: Vessel) -> NDArray[np.bool_]:
     return kept
 
 
-def residual_of(vessel: Vessel, fit: Fit, data: TissueData | None = None) -> Tensor:
+def residual_of(vessel: Vessel, fit: Fit, data: Quadratic | None = None) -> Tensor:
     """b − Gx of the whole volume, ``grid.shape`` HU⁻¹; of other data than the fit's if they are
     given."""
     data = data or vessel.data
     image = np.full(vessel.grid.shape, fit.parameters[FAT])
     image[tuple(vessel.index.T)] += fit.drawing.image
-    return data.b - data.apply(torch.from_numpy(image).to(data.b))
+    return data.left(torch.from_numpy(image).to(data.b)[None])[0]
 
 
-def beside(data: TissueData, vessel: Vessel, fit: Fit) -> Tensor | None:
+def beside(data: Quadratic, vessel: Vessel, fit: Fit) -> Tensor | None:
     """What stands beside a fitted vessel, ``grid.shape`` HU above the fat; None where nothing is
     striking.
 
@@ -118,10 +120,10 @@ def beside(data: TissueData, vessel: Vessel, fit: Fit) -> Tensor | None:
     near[tuple(vessel.index[fit.drawing.shares[0] > 0.02].T)] = True
     step = np.array(vessel.grid.spacing)
     free = ndimage.distance_transform_edt(~near, sampling=step) > _APART_MM
-    scores = np.where(free, data.scores(left, _BODY_MM), 0.0)
+    scores = np.where(free, scores_in(data, left, _BODY_MM), 0.0)
     if np.abs(scores).max() <= STRIKING:
         return None
-    shown = data.pilot(left)
+    shown = pilot(data, left)
     bodies, _ = ndimage.label(
         free & (np.abs(shown) > max(_SHARE * np.abs(shown[free]).max(), _SEEN_HU))
     )
@@ -132,7 +134,7 @@ def beside(data: TissueData, vessel: Vessel, fit: Fit) -> Tensor | None:
     mask = torch.from_numpy(
         free & (ndimage.distance_transform_edt(~there, sampling=step) <= _EDGE_MM)
     ).to(left)
-    return data.least_squares(left, _BESIDE_STEPS, mask, _BESIDE_HU**-2)
+    return least_squares(data, left, _BESIDE_STEPS, mask, _BESIDE_HU**-2)
 
 
 def scores_of(vessel: Vessel, fit: Fit, explained: Tensor | float = 0.0) -> Floats:
@@ -145,7 +147,7 @@ def scores_of(vessel: Vessel, fit: Fit, explained: Tensor | float = 0.0) -> Floa
         vessel, fit: see :class:`recon.vessel.model.Vessel`.
         explained: ``grid.shape`` HU⁻¹, G times what is known beside the fit.
     """
-    scores = vessel.data.scores(residual_of(vessel, fit) - explained, _BODY_MM)
+    scores = scores_in(vessel.data, residual_of(vessel, fit) - explained, _BODY_MM)
     scores[tuple(vessel.index[~_between_ends(vessel)].T)] = 0.0
     return scores
 
@@ -167,7 +169,7 @@ def leftover(vessel: Vessel, fit: Fit) -> Leftover:
     beside = bool(inside < 0 or fit.drawing.shares[0][inside] < 0.5)
     return Leftover(
         score,
-        float(data.pilot(residual_of(vessel, fit))[place]) if score > STRIKING else 0.0,
+        float(pilot(data, residual_of(vessel, fit))[place]) if score > STRIKING else 0.0,
         (z, y, x),
         beside,
     )

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 from threadpoolctl import threadpool_limits
 
+from recon.data_term import Quadratic
 from recon.vessel.core import CorePrior, CoreSpace
-from recon.vessel.data import TissueData
+from recon.vessel.data import grid_of, in_hu, pilot
 from recon.vessel.figures import Estimate, draws_of, estimate
 from recon.vessel.model import FIBROUS, Fit, Vessel
 from recon.vessel.particles import Cloud, lead
@@ -212,7 +213,7 @@ def read_regions(regions: Mapping[str, Any], volume: Any) -> dict[str, float]:
 # Many small matrices: BLAS threads wait for each other three times longer than one thread computes.
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def read_plaque(
-    data: TissueData,
+    term: Quadratic,
     point: Any = None,
     *,
     point_sd: float = 0.4,
@@ -224,7 +225,7 @@ def read_plaque(
     """Read the vessel in an inset.
 
     Args:
-        data: :meth:`TissueData.of_scan`, or any other statistic with its operator.
+        term: of the scan, in mm⁻¹ (:meth:`recon.least_squares.inset_problem.InsetProblem.term`).
         point: ``(z, y, x)`` mm where a reader sees the plaque; None: blind, in the largest vessel.
         point_sd: standard deviation of its error along each axis, mm.
         particles: shapes of the core that are followed; fewer than 300 widen the spread of the
@@ -251,11 +252,12 @@ def read_plaque(
         )
     rng = np.random.default_rng(seed)
 
-    def fitted(seen: TissueData) -> tuple[Vessel, Fit]:
-        start = find_vessel(seen.pilot(), seen.grid, None if where is None else np.array(where))
+    def fitted(seen: Quadratic) -> tuple[Vessel, Fit]:
+        start = find_vessel(pilot(seen), grid_of(seen), None if where is None else np.array(where))
         vessel = Vessel(seen, start, vessel_prior)
         return vessel, vessel.fit(vessel.first_guess(), expected=True)
 
+    data = in_hu(term)
     vessel, fit = fitted(data)
     taken = 0.0
     for _ in range(_ROUNDS):
@@ -263,7 +265,7 @@ def read_plaque(
         if foreign is None:
             break
         taken = float(foreign.abs().max())
-        vessel, fit = fitted(replace(data, b=data.b - data.apply(foreign)))
+        vessel, fit = fitted(data.less(foreign[None]))
     stands = leftover(vessel, fit)
     if stands.score <= STRIKING or not stands.beside:
         # Bodies in the vessel do not explain what lies beside it; they would only stand in for it.

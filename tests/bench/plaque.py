@@ -34,7 +34,7 @@ from recon.analytic.inset import InsetFbp
 from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.mbir import Mbir
 from recon.study.paper.plaque_scan import inset_grid
-from recon.vessel import TissueData, read_plaque
+from recon.vessel import read_plaque
 from recon.vessel.reading import CERTAIN, read_regions
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.files import atomic_write
@@ -198,7 +198,7 @@ class Draws:
         if path.exists() or k % what.every:
             return
         b, fbp = self.drawn(what.scene, what.exposure_s, k)
-        data = TissueData.of_term(self.problem.term_of(b[None], what.exposure_s))
+        data = self.problem.term_of(b[None], what.exposure_s)
         plaque = scene_of(what.scene)[1] if what.scene in SCANNED else plaque_scene()[1]
         seeds = np.array(plaque.to_scanner([plaque.section("lumen", 0.0)[0], 0.0, 0.0]))[::-1]
         centre, true = np.array(plaque.to_scanner(plaque.core_center))[::-1], truth(plaque)

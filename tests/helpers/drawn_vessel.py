@@ -9,11 +9,12 @@ import numpy as np
 import torch
 from inset_operators import HU, problem, term_of
 
+from recon.data_term import Quadratic
 from recon.gram.gram import Gram
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import NetworkConfig
 from recon.mbir.unrolled import Unrolled
-from recon.vessel.data import TissueData
+from recon.vessel.data import in_hu
 from torchpcct import Projector, VolumeGrid
 
 VALUES = {"fat": -90.0, "wall": 50.0, "fibrous": 100.0, "lumen": 400.0}
@@ -86,11 +87,12 @@ def operator(shape=(26, 24, 24), voxel=0.3):
 
 
 def data(gram, volume, seed=None):
-    """Statistic of a volume on ``gram.finer``; noise of the operator for a seed."""
-    b = HU**2 * gram.statistic(volume)
+    """The data term of a volume on ``gram.finer``, in HU; noise of the operator for a seed."""
+    b = HU * gram.statistic(volume)
     if seed is not None:
-        b = b + gram.noise(generator=torch.Generator().manual_seed(seed)) * HU
-    return TissueData(b, gram, HU**2)
+        b = b + gram.noise(generator=torch.Generator().manual_seed(seed))
+    term = Quadratic(gram, b[None], torch.ones(1), gram.grid.spacing, 1000.0 * HU)
+    return in_hu(term)
 
 
 def inset():

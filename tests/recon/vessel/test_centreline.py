@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from recon.vessel.centreline import Centreline, follow
+from recon.vessel.data import pilot
 from recon.vessel.start import find_vessel
 from torchpcct import VolumeGrid
 
@@ -101,8 +102,8 @@ def test_what_holds_a_walk_back_is_no_end():
 
 
 def test_a_vessel_is_found_wherever_the_zero_lies(gram):
-    pilot = drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0, samples=2)).pilot()
-    still, moved = (find_vessel(pilot + zero, gram.grid, None) for zero in (0.0, -150.0))
+    seen = pilot(drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0, samples=2)))
+    still, moved = (find_vessel(seen + zero, gram.grid, None) for zero in (0.0, -150.0))
     assert np.allclose(moved.lumen.points, still.lumen.points, atol=1e-6)
     assert np.allclose(moved.outer.points, still.outer.points, atol=1e-6)
     assert np.allclose(moved.radii, still.radii, atol=1e-6)

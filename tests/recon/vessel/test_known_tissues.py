@@ -15,7 +15,7 @@ from recon import reconstruct
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import NetworkConfig
 from recon.mbir.unrolled import Unrolled
-from recon.vessel import TissueData, VesselPrior, known, read_plaque
+from recon.vessel import VesselPrior, known, read_plaque
 from recon.vessel.known import KnownTissues, KnownVessel
 
 BALL = np.s_[2:5, 2:5, 2:5]
@@ -42,13 +42,9 @@ def solved(drawn, network, fine):
     """Without and with tissues, HU, and the notes."""
     b = statistic(drawn, fine, 1)
     method = network.with_known(KnownTissues())
-    found = method.solved(b)
+    (found,) = method.solve(b)
     with torch.no_grad():
-        return (
-            network(b)[0],
-            found.normal.hu(found.u)[0],
-            found.notes[0],
-        )
+        return network(b)[0], found.volume, found.report
 
 
 def test_the_vessel_is_sharper_and_its_core_at_full_contrast(drawn, solved, truth):
@@ -89,10 +85,10 @@ def test_the_data_are_kept(drawn, network, solved, fine):
 
 def test_without_a_vessel_it_is_the_plain_reconstruction(drawn, network):
     b = statistic(drawn, torch.full(drawn.gram.finer.shape, -90.0), 2)
-    found = network.with_known(KnownTissues()).solved(b)
-    assert torch.equal(found.u, network.solved(b).u.detach())
-    assert not found.notes[0]["tissues"]["used"]
-    assert "no tissues were fitted" in found.notes[0]["warnings"][0]
+    (found,) = network.with_known(KnownTissues()).solve(b)
+    assert torch.equal(found.volume, network(b)[0])
+    assert not found.report["tissues"]["used"]
+    assert "no tissues were fitted" in found.warnings[0]
 
 
 @pytest.mark.extended
@@ -100,9 +96,9 @@ def test_tissues_that_do_not_explain_the_data_are_not_used(drawn, network, fine,
     reading = known.read_plaque
     monkeypatch.setattr(known, "read_plaque", lambda *a, **k: replace(reading(*a, **k), chi2=2.0))
     b = statistic(drawn, fine, 1)
-    found = network.with_known(KnownTissues()).solved(b)
-    assert torch.equal(found.u, network.solved(b).u.detach())
-    assert "residual is 2.00" in found.notes[0]["warnings"][0]
+    (found,) = network.with_known(KnownTissues()).solve(b)
+    assert torch.equal(found.volume, network(b)[0])
+    assert "residual is 2.00" in found.warnings[0]
 
 
 def test_what_is_believed_of_the_vessel_reaches_the_reading(drawn, network, fine, monkeypatch):
@@ -115,14 +111,14 @@ def test_what_is_believed_of_the_vessel_reaches_the_reading(drawn, network, fine
     monkeypatch.setattr(known, "read_plaque", reading)
     b = statistic(drawn, fine, 1)
     for believed in (None, VesselPrior(wall=(20.0, 5.0))):
-        network.with_known(KnownTissues(believed)).with_fidelity(1.0).solved(b)
+        network.with_known(KnownTissues(believed)).with_fidelity(1.0).solve(b)
     assert seen == [None, VesselPrior(wall=(20.0, 5.0))]
 
 
 @pytest.mark.extended
 def test_a_core_is_drawn_as_far_as_it_is_probable(drawn, network, fine, monkeypatch):
     b = statistic(drawn, fine, 1)
-    reading = read_plaque(TissueData.of_term(b))
+    reading = read_plaque(b)
     monkeypatch.setattr(
         known, "read_plaque", lambda *arguments, **settings: replace(reading, presence=0.25)
     )

@@ -8,13 +8,14 @@ import pytest
 import torch
 
 from recon.vessel import layer
+from recon.vessel.data import grid_of, pilot
 from recon.vessel.layer import LENGTHS_MM, LayerEstimate, LayerField
 from recon.vessel.model import Vessel
 from recon.vessel.start import find_vessel
 
 
 def fitted(data):
-    vessel = Vessel(data, find_vessel(data.pilot(), data.grid, None))
+    vessel = Vessel(data, find_vessel(pilot(data), grid_of(data), None))
     return vessel.fit(vessel.first_guess(), expected=True, tolerance=1e-3)
 
 
@@ -102,9 +103,9 @@ def test_a_step_that_leads_up_is_not_taken(fit, dense, monkeypatch):
 def test_change_is_symmetric_and_that_of_a_new_fit(data, fit):
     estimate = LayerEstimate(fit)
     noise = [
-        data.gram.noise(generator=torch.Generator().manual_seed(s)).double()
+        data.operator.noise(generator=torch.Generator().manual_seed(s)).double()
         * 0.05
-        * data.scale**0.5
+        * float(data.scale) ** 0.5
         for s in (2, 3)
     ]
     changes = [estimate.change(v.numpy()) for v in noise]
@@ -112,7 +113,7 @@ def test_change_is_symmetric_and_that_of_a_new_fit(data, fit):
     assert cross[0] == pytest.approx(
         cross[1], abs=0.02 * float((changes[0] * noise[0].numpy()).sum())
     )
-    others = [replace(data, b=data.b + s * noise[0].to(data.b)) for s in (1, -1)]
+    others = [replace(data, b=data.b + s * noise[0].to(data.b)[None]) for s in (1, -1)]
     there = [LayerEstimate(fitted(other)).image for other in others]
     real = 0.5 * (there[0] - there[1])
     # The outlines bend differently about a core than without it, and the map is that without.

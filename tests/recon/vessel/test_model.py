@@ -10,6 +10,7 @@ import torch
 from drawn_vessel import INNER_MM, LUMEN_MM, VALUES, WALL_MM
 
 from recon.vessel.core import CorePrior, CoreSpace
+from recon.vessel.data import grid_of, in_hu, pilot
 from recon.vessel.model import FAT, FIBROUS, LUMEN, THICKNESS, Vessel
 from recon.vessel.start import find_vessel
 
@@ -17,7 +18,7 @@ from recon.vessel.start import find_vessel
 @pytest.fixture(scope="module")
 def vessel(gram):
     data = drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0))
-    return Vessel(data, find_vessel(data.pilot(), data.grid, None))
+    return Vessel(data, find_vessel(pilot(data), grid_of(data), None))
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +69,7 @@ def test_fit_goes_to_the_mode_from_afar(gram, seed):
     """It stopped where a shortened step gained little: for seed 5 at 63 in the log posterior
     short of the mode."""
     data = drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0, samples=2), seed)
-    vessel = Vessel(data, find_vessel(data.pilot(), data.grid, None))
+    vessel = Vessel(data, find_vessel(pilot(data), grid_of(data), None))
     afar = vessel.first_guess()
     afar[vessel.lumen_part] *= 1.3
     afar[vessel.outer_part] *= 0.8
@@ -117,7 +118,7 @@ def test_fit_is_a_mode(vessel, fit):
     assert 0.5 * fit.gradient @ fit.covariance @ fit.gradient < 0.2
     volume = torch.full(vessel.grid.shape, fit.parameters[FAT])
     volume[tuple(vessel.index.T)] += torch.from_numpy(fit.drawing.image).float()
-    exact = (vessel.data.b - vessel.data.apply(volume)).numpy()[tuple(vessel.index.T)]
+    exact = vessel.data.left(volume[None])[0].numpy()[tuple(vessel.index.T)]
     assert np.allclose(fit.residual, exact, atol=2e-5 * float(vessel.data.b.abs().max()))
 
 
@@ -154,23 +155,19 @@ def test_evidence_of_a_body_is_the_ratio_of_two_gaussian_integrals(vessel, fit):
 def test_data_of_a_scan_in_hu(problem, clean):
     """b and G in HU: the likelihood's mode is the least-squares volume, whatever unit it is
     written in."""
-    from recon.vessel.data import TissueData
-
-    found = TissueData.of_scan(clean, problem)
+    found = in_hu(problem.term(clean))
     volume = 30.0 * torch.randn(problem.grid.shape, generator=torch.Generator().manual_seed(0))
     hu = problem.mu_ref / 1000
     attenuation = (volume / 1000 + 1) * problem.mu_ref - problem.level
     exact = (problem.term(clean).b[0] - problem.gram.apply(attenuation)) * hu
-    assert torch.allclose(
-        found.b - found.apply(volume), exact, atol=1e-4 * float(exact.abs().max())
-    )
+    assert torch.allclose(found.left(volume[None])[0], exact, atol=1e-4 * float(exact.abs().max()))
 
 
 def test_no_vessel():
     gram = drawn_vessel.operator((8, 12, 12))
     data = drawn_vessel.data(gram, torch.full(gram.finer.shape, -90.0))
     with pytest.raises(ValueError, match="nothing stands out"):
-        find_vessel(data.pilot(), data.grid, None)
+        find_vessel(pilot(data), grid_of(data), None)
     with pytest.raises(ValueError, match="outside of the volume"):
         find_vessel(
             drawn_vessel.image(gram.grid, 0.0).numpy(), gram.grid, np.array([50.0, -30.0, -30.0])

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from recon.vessel import VesselPrior
+from recon.vessel.data import grid_of, pilot
 from recon.vessel.model import FIBROUS, WALL, Vessel
 from recon.vessel.start import find_vessel
 
@@ -33,7 +34,7 @@ def test_what_cannot_be_believed_is_refused(values, error, match):
 @pytest.fixture(scope="module")
 def seen(gram):
     data = drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0))
-    return data, find_vessel(data.pilot(), data.grid, None)
+    return data, find_vessel(pilot(data), grid_of(data), None)
 
 
 def test_a_firm_belief_holds_and_a_loose_one_gives_way(seen):

@@ -12,6 +12,8 @@ import torch
 from scipy import ndimage
 
 from recon.vessel import read_plaque, reading
+from recon.vessel.data import grid_of, pilot
+from recon.vessel.data import scores as scores_in
 from recon.vessel.model import Vessel
 from recon.vessel.quality import LENGTH_MM, PRIOR_VARIANCE_HU2, STRIKING, Leftover, misfit, texture
 from recon.vessel.report import save, table
@@ -21,7 +23,7 @@ from torchpcct.volume import Volume
 
 def fitted(gram, volume, seed):
     data = drawn_vessel.data(gram, volume, seed)
-    vessel = Vessel(data, find_vessel(data.pilot(), data.grid, None))
+    vessel = Vessel(data, find_vessel(pilot(data), grid_of(data), None))
     fit = vessel.fit(vessel.first_guess())
     body = np.zeros((1, len(vessel.index)))
     return vessel, vessel.fit(np.append(fit.parameters, 0.0), body)
@@ -141,8 +143,10 @@ def test_noise_alone_is_not_striking_anywhere_in_the_volume(gram):
     data = drawn_vessel.data(gram, torch.zeros(gram.finer.shape))
     scores = np.array(
         [
-            data.scores(
-                gram.noise(generator=torch.Generator().manual_seed(k)) * drawn_vessel.HU, (0.4, 1.2)
+            scores_in(
+                data,
+                gram.noise(generator=torch.Generator().manual_seed(k)) * drawn_vessel.HU,
+                (0.4, 1.2),
             )
             for k in range(20)
         ]

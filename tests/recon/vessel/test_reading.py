@@ -1,6 +1,7 @@
 """Readings of a drawn vessel with and without a core: figures, refusal, files."""
 
 import json
+from dataclasses import replace
 
 import drawn_vessel
 import numpy as np
@@ -9,7 +10,7 @@ from drawn_vessel import VALUES
 from refusals import refused
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from recon.vessel import TissueData, read_plaque, reading
+from recon.vessel import read_plaque, reading
 from recon.vessel.figures import Estimate
 from recon.vessel.reading import _doubt
 from recon.vessel.report import save, table
@@ -92,8 +93,8 @@ def test_refusals(gram):
         ("particles", lambda: read_plaque(data, particles=3)),
         ("point must be 3 numbers", lambda: read_plaque(data, (1.0, 2.0))),
         ("VesselPrior, got tuple", lambda: read_plaque(data, vessel_prior=(50.0, 15.0))),
-        ("NaN", lambda: TissueData(data.b * float("nan"), gram, 1.0)),
-        ("one \\(z, y, x\\) grid", lambda: TissueData(data.b[1:], gram, 1.0)),
+        ("NaN", lambda: read_plaque(replace(data, b=data.b * float("nan")))),
+        ("one \\(z, y, x\\) grid", lambda: read_plaque(replace(data, b=data.b[:, 1:]))),
     )
 
 
