@@ -376,9 +376,7 @@ def test_a_scan_of_a_region_is_reconstructed_there(here, cli, clean):
 
 
 def test_what_a_drawn_vessel_has_changed_is_written_and_shown(here, cli, clean, monkeypatch):
-    monkeypatch.setattr(
-        KnownVessel, "drawn", lambda self, problem, b, *_: Drawn(torch.zeros(b.shape))
-    )
+    monkeypatch.setattr(KnownVessel, "drawn", lambda self, term, _: Drawn(torch.zeros(term.shape)))
     clean.with_noise(1.0, 0).save("mine.h5")
     cli("reconstruct mine.h5 --method mbir --vessel --out a.nii.gz")
     report = json.loads((here / "a.nii.gz.json").read_text(encoding="utf-8"))

@@ -300,6 +300,31 @@ def test_a_lambda_is_computed_here(task, processes, tmp_path, caplog):
     assert "mine is computed here, not by other processes" in caplog.text
 
 
+def test_without_an_executor_jobs_are_run_here_as_they_are(tmp_path):
+    """In their order, with arguments that nobody could pickle; what is done stays done."""
+    ran, seen = [], []
+
+    def first(folder, number):
+        (folder / "a").write_text("1")
+        return number() + 1
+
+    def second(folder):
+        assert ran == ["first"]
+        raise ValueError("no")
+
+    jobs = [Job("first", first, (lambda: 41,)), Job("second", second, after=("first",), args=())]
+    progress = lambda *step: seen.append(step)  # noqa: E731
+    with pytest.raises(ValueError, match="no"):
+        run(jobs, tmp_path / "new", None, progress, lambda job: ran.append(job.name))
+    assert (tmp_path / "new" / "a").read_text() == "1"
+    assert seen == [("first", 0.0), ("second", 0.5)]
+    seen.clear()
+    assert run(jobs[:1], tmp_path / "new", None, progress) == {"first": 42}
+    assert seen == [("first", 0.0), ("first", 1.0)]
+    assert run([], tmp_path / "none", None) == {}
+    assert not (tmp_path / "none").exists()
+
+
 @pytest.mark.extended
 def test_a_job_whose_process_dies_is_repeated_and_left_out_after_three(
     processes, tmp_path, caplog, capfd
