@@ -4,13 +4,15 @@ computes is loaded."""
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from torchpcct.validate import choice, meant, number
 
 __all__ = [
+    "CONTRASTS",
     "FILTERS",
     "KERNELS",
     "METHODS",
@@ -20,6 +22,7 @@ __all__ = [
     "loaded",
     "mbir_options",
     "meant_method",
+    "split_energies",
     "split_method",
 ]
 
@@ -33,12 +36,31 @@ KERNELS: tuple[str, ...] = ("soft", "standard", "detail", "bone", "ram-lak")
 FILTERS: tuple[str, ...] = ("gaussian", "perona_malik", "bilateral", "nlm", "tv", "bm4d")
 """Of :mod:`recon.filters`; a hyphen is as good as the underscore."""
 
+CONTRASTS: Mapping[str, tuple[str, str]] = {"iodine": ("blood_iodine", "fibrous_tissue")}
+"""Contrasts that an evaluation's option ``energies=`` knows by a name: two materials."""
+
+_ENERGIES = re.compile(r"(?P<before>[:,])energies(?:=(?P<contrast>[^,@]*))?(?=,|$)")
+"""The option among those of a method, wherever it stands."""
+
 _MBIR = ("weights", "network", "fidelity", "vessel", "tissues", "prior")
 
 
 def filter_name(text: str) -> str:
     """A filter's name with the underscore that it has in :data:`FILTERS`."""
     return text.replace("-", "_")
+
+
+def split_energies(spec: str) -> tuple[str, str | None]:
+    """A method of an evaluation without its option ``energies``, and what that says: ``fbp:soft``
+    and ``iodine`` from ``fbp:soft,energies=iodine``; empty without a value, None without the
+    option."""
+    found = _ENERGIES.search(spec)
+    if found is None:
+        return spec, None
+    before, after = spec[: found.start()], spec[found.end() :]
+    if found["before"] == ":" and after:
+        before, after = f"{before}:", after.removeprefix(",")
+    return before + after, (found["contrast"] or "").strip()
 
 
 def split_method(spec: Any) -> tuple[str, dict[str, Any]]:
@@ -51,6 +73,11 @@ def split_method(spec: Any) -> tuple[str, dict[str, Any]]:
         ValueError, TypeError: an unknown method or option, or a value that it does not take.
         FileNotFoundError: weights that do not exist.
     """
+    if isinstance(spec, str) and split_energies(spec)[1] is not None:
+        raise ValueError(
+            f"energies= is an option of evaluations, got {spec!r}: weigh the bins of the scan "
+            "before, scan.weighted(torchpcct.spectral.bin_weights(scanner, (a, b), {material: mm}))"
+        )
     name, _, rest = spec.partition(":") if isinstance(spec, str) else (spec, "", "")
     choice("method", name, METHODS)
     if not rest:

@@ -20,6 +20,8 @@ from fresh_python import run_python
 
 import recon
 from torchpcct import ConeBeam, Projector, VolumeGrid
+from torchpcct.scanner import SiliconDetector, presets
+from torchpcct.spectral import contrast_information, weighting_gain
 from torchpcct.vector_geometry import VectorGeometry
 
 ROOT = Path(__file__).parents[1]
@@ -179,6 +181,45 @@ def test_every_public_name_is_in_the_reference(tmp_path):
     wanted = {(m, n) for m in modules for n in getattr(importlib.import_module(m), "__all__", ())}
     assert len(wanted) > 1000
     assert not wanted - entries
+
+
+def test_the_page_of_energies_says_what_is_computed():
+    """Its tables: the factors of three contrasts, and what resolution and shared charge leave."""
+    page = (DOCS / "howto" / "energies.md").read_text(encoding="utf-8")
+    rows = {
+        cells[0]: cells[1:]
+        for line in page.splitlines()
+        if line.startswith("| ") and (cells := [c.strip() for c in line.strip("| ").split("|")])
+    }
+    scanner = presets.pcct(views=1, rows=1, columns=3, mode="spectral")
+    fat, lumen = {"adipose": 240.0}, ("blood_iodine", "fibrous_tissue")
+    for name, contrast in (
+        ("lumen with iodine against fibrous tissue", lumen),
+        ("fibrous tissue against fat", ("fibrous_tissue", "adipose")),
+        ("core against fibrous tissue", ("necrotic_core", "fibrous_tissue")),
+    ):
+        found = [weighting_gain(scanner, contrast, fat, kind)[1] for kind in ("bins", "energies")]
+        assert rows[name] == [f"{f:.2f}" for f in found]
+
+    def information(kind, **changes):
+        detector = SiliconDetector("spectral", **changes)
+        return contrast_information(scanner.replace(detector=detector), lumen, fat, kind)[1]
+
+    best = information("bins", sigma_kev=0.1)
+    tables = [
+        table
+        for table in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE)
+        if table.startswith(("| resolution", "| shared charge"))
+    ]
+    for table, column, changes in (
+        (tables[0], 3, {"sigma_kev": 1.6}),
+        (tables[0], 5, {"sigma_kev": 4.0}),
+        (tables[1], 3, {"charge_sharing": 0.1}),
+    ):
+        _, _, shown, factor = ([c.strip() for c in t.split("|")] for t in table.splitlines())
+        weighted = information("bins", **changes)
+        assert shown[column + 1] == f"{weighted / best:.3f}"
+        assert factor[column + 1] == f"{weighted / information('sum', **changes):.2f}"
 
 
 @pytest.mark.parametrize("path", GALLERY, ids=lambda p: p.stem)

@@ -26,7 +26,16 @@ from torch import Tensor
 from torchpcct.threads import run
 from torchpcct.validate import number
 
-__all__ = ["compound_poisson", "draw", "normal", "poisson", "seed_key", "stream", "thinned"]
+__all__ = [
+    "compound_poisson",
+    "draw",
+    "normal",
+    "poisson",
+    "seed_key",
+    "split",
+    "stream",
+    "thinned",
+]
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -174,6 +183,23 @@ def _thinned_rows(
 
 
 @njit(nogil=True, cache=True)
+def _split_rows(
+    begin: int, end: int, counts: Any, chance: Any, first: Any, key: Any, out: Any
+) -> None:
+    for i in range(begin, end):
+        for j in range(counts.shape[1]):
+            n, p = np.float64(counts[i, j]), np.float64(chance[i, j])
+            if not (0.0 <= n < math.inf and 0.0 <= p <= 1.0):
+                out[i, j] = np.nan
+            elif p <= 0.5:
+                out[i, j] = 0.0 if n * p == 0.0 else _binomial_one(n, p, stream(key, first[i] + j))
+            else:
+                out[i, j] = n - (
+                    0.0 if p == 1.0 else _binomial_one(n, 1.0 - p, stream(key, first[i] + j))
+                )
+
+
+@njit(nogil=True, cache=True)
 def _poisson_rows(
     begin: int, end: int, mean: Any, first: Any, scale: float, key: Any, out: Any
 ) -> None:
@@ -215,7 +241,9 @@ _QUANTA = 0
 _ELECTRONICS = 1
 _THINNING = 2
 _THINNED_ELECTRONICS = 3
-"""Purposes of a reading's random numbers: each has a stream of its own."""
+_SPLIT = 4
+"""Purposes of a reading's random numbers: each has a stream of its own; the last and all after it
+are those of the bins of :func:`split`."""
 
 
 def seed_key(seed: int, purpose: int = _QUANTA) -> Any:
@@ -388,6 +416,46 @@ def thinned(
             tuple(counts.shape), first_index, seed, counts.dtype, purpose=_THINNED_ELECTRONICS
         )
         out.add_(added, alpha=float(electronic) * math.sqrt(1.0 - fraction**2))
+    return out
+
+
+def split(counts: Tensor, expected: Tensor, first_index: Any, seed: int) -> Tensor:
+    """Counts of energy bins whose sum is given: multinomial with the shares that the bins have of
+    the expected counts.
+
+    Poisson counts that are split so are independent Poisson counts of the bins, exactly: what was
+    drawn of the sum and what is read of the bins are then one realisation.
+
+    Args:
+        counts: ``(..., n)`` whole numbers ≥ 0, float32 or float64, on the CPU.
+        expected: ``(bins, ..., n)`` ≥ 0, of each bin, in any unit; dtype of ``counts``.
+        first_index: ``(...)`` whole numbers, the global index of the first reading of each row of
+            ``n``.
+        seed: realisation number, ≥ 0.
+
+    Returns:
+        ``(bins, ..., n)`` of the dtype of ``counts``; NaN where nothing is expected or a value is
+        negative or not finite.
+
+    Raises:
+        TypeError, ValueError: as :func:`poisson`; ``expected`` of another shape, or without bins.
+    """
+    if expected.ndim != counts.ndim + 1 or not len(expected):
+        raise ValueError(
+            f"expected must have the shape (bins, …) of counts {tuple(counts.shape)}, got "
+            f"{tuple(expected.shape)}"
+        )
+    out = torch.empty_like(expected)
+    left, rest = counts.clone(), expected.sum(0, dtype=torch.float64)
+    for k, own in enumerate(expected[:-1]):
+        chance = (own / rest).clamp_(max=1.0).to(counts.dtype)
+        # Nothing is left to share where all that is expected lies in the bins before.
+        chance = torch.where((rest <= 0) & (left == 0) & (own == 0), 0.0, chance)
+        key = seed_key(seed, _SPLIT + k)
+        out[k] = _drawn(_split_rows, (left, chance), first_index, key)
+        left -= out[k]
+        rest -= own
+    out[-1] = left
     return out
 
 

@@ -58,11 +58,13 @@ _STUDY_TASKS = (
     "line_pairs_10",
     "line_pairs_14",
     "rod",
+    "lumen",
 )
 _STUDY_METHODS = (
     "fbp:soft",
     "fbp:standard",
     "fbp:detail",
+    "fbp:soft,energies",
     "gaussian@fbp:standard",
     "perona_malik@fbp:standard",
     "nlm@fbp:standard",
@@ -449,7 +451,9 @@ methods: fbp:KERNEL, pwls, mbir, mbir:fidelity=1, mbir:weights=FILE, mbir:vessel
          mbir:prior=PRIOR (a filter below, or package.module:function),
          mbir:weights=FILE,network=package.module:Class,
          FILTER@fbp:KERNEL (gaussian, perona_malik, bilateral, nlm, tv, bm4d),
-         package.module:function of (scan, grid), files:FOLDER
+         package.module:function of (scan, grid), files:FOLDER;
+         each with energies=CONTRAST among its options (fbp:soft,energies=iodine): energy bins
+         summed with the weights that show the contrast best (task, iodine or two materials A/B)
 
 """
 

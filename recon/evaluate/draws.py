@@ -48,13 +48,23 @@ class Draws:
         store: keeps noise-free scans and what does not depend on a method.
         seed: of the first realisation.
         kernels: of FBP that methods ask for.
+
+    Attributes:
+        prefix: of the names of kept pieces.
     """
+
+    prefix = ""
 
     def __init__(
         self, task: Task, store: Store, seed: int = 0, kernels: Sequence[str] = ()
     ) -> None:
         self.task, self.store, self.seed = task, store, seed
         self.kernels = tuple(dict.fromkeys(kernels))
+
+    @property
+    def key(self) -> str:
+        """Of what does not depend on a method."""
+        return f"1 {self.task.fingerprint}"
 
     @cached_property
     def clean(self) -> tuple[Scan, Scan]:
@@ -64,10 +74,11 @@ class Draws:
     @cached_property
     def facts(self) -> Facts:
         """Of the task."""
-        found: Facts = self.store.piece(
-            "facts", f"1 {self.task.fingerprint}", lambda: self.task.facts(self.store)
-        )
+        found: Facts = self.store.piece(f"{self.prefix}facts", self.key, self._facts)
         return found
+
+    def _facts(self) -> Facts:
+        return self.task.facts(self.store)
 
     @cached_property
     def problem(self) -> InsetProblem:
@@ -93,7 +104,7 @@ class Draws:
     def exact_covariances(self, kernels: Sequence[str]) -> dict[str, NDArray[np.float64]]:
         """Of the ROI means of FBP at 1 s, kernel → ``(rois, 2, rois, 2)`` HU²; it falls as 1 /
         exposure."""
-        regions, key = self.task.regions, f"1 {self.task.fingerprint}"
+        regions, key = self.task.regions, self.key
         functionals: list[Any] = [
             SimpleNamespace(weights=w) for pair in regions.values() for w in pair
         ]
@@ -111,7 +122,9 @@ class Draws:
         def of(kernel: str) -> NDArray[np.float64]:
             return together()[kernel]
 
-        return {k: self.store.piece(f"exact_{k}", key, partial(of, k)) for k in kernels}
+        return {
+            k: self.store.piece(f"{self.prefix}exact_{k}", key, partial(of, k)) for k in kernels
+        }
 
     def response(self, network: Mbir, reader: Any, exposure_s: float) -> dict[str, Any]:
         """``adjoints`` ``(2 · rois, z, y, x)`` of MBIR's ROI means, ``mean`` and ``covariance``
@@ -159,10 +172,8 @@ class Draws:
             ]
             return float(np.sqrt(np.mean(np.square(found))))
 
-        name = f"sigma_{method.kernels[0]}_{exposure_s:g}s_{smooths:g}"
-        return float(
-            self.store.piece(name, f"1 {exposure_s} {smooths} {self.task.fingerprint}", compute)
-        )
+        name = f"{self.prefix}sigma_{method.kernels[0]}_{exposure_s:g}s_{smooths:g}"
+        return float(self.store.piece(name, f"{self.key} {exposure_s} {smooths}", compute))
 
 
 class Simulated:

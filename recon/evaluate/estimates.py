@@ -11,7 +11,8 @@ response (:mod:`recon.evaluate.response`), of other methods by the reference's R
 but noise and d′ is exact.
 
 * slope: contrast that the signal adds over the true one; a method may buy low noise with it, so
-  contrasts are compared at slope 1: variance over slope²;
+  contrasts are compared at slope 1: variance over slope², in units of the true contrast, which of
+  weighted energy bins (:mod:`recon.evaluate.energies`) is another than of their sum;
 * ``without signal``: contrast that is read where there is none (less what other tissues in the ROIs
   make);
 * the paper's CNR: (background − signal) / √(σ² + σ²) of the ROI means over realisations;
@@ -157,6 +158,12 @@ class _Figures:
             self.slope(roi),
         )
 
+    def log_relative(self, roi: int) -> Figure:
+        """ln of that variance in units of the squared true contrast: methods whose HU differ can be
+        compared."""
+        scale = _log_of_square(self.true[roi])
+        return joint(lambda v: v - scale, self.log_corrected(roi))
+
     def cnr(self, roi: int) -> Figure:
         """The paper's."""
         sign = self._sign[roi]
@@ -238,6 +245,7 @@ def records_of(
     absent: Floats,
     rois: tuple[str, ...],
     exact: Floats | None = None,
+    base_true: Floats | None = None,
 ) -> list[Record]:
     """All figures of a method at an exposure, one record each: task, method, exposure, figure,
     where, value, interval.
@@ -251,6 +259,7 @@ def records_of(
         absent: ``(rois,)`` true contrasts without it, HU.
         rois: their names.
         exact: covariance of a linear method's ROI means; None: drawn.
+        base_true: ``true`` of the linear reference, if its HU are others; None: the same.
     """
     control = reference
     if readings.control is not None:
@@ -258,7 +267,13 @@ def records_of(
         control = Known(covariance, mean, drawn)
     own, other = (
         _Figures(readings, true, absent, control, exact),
-        _Figures(base, true, absent, reference, reference.covariance),
+        _Figures(
+            base,
+            true if base_true is None else base_true,
+            absent,
+            reference,
+            reference.covariance,
+        ),
     )
     found: list[Record] = []
 
@@ -306,9 +321,10 @@ def records_of(
         add("contrast without signal", roi, own.without(k), "HU")
         if _value(slope) > _LEAST_SLOPE:
             add("contrast SD at slope 1", roi, own.log_corrected(k), "HU", transform=0.5)
-            factor("contrast at slope 1", roi, other.log_corrected(k), own.log_corrected(k))
-    best = math.log(facts.limit_hu**2 / exposure_s)
-    factor("limit of the data", "lesion", other.log_corrected(rois.index("lesion")), best)
+            factor("contrast at slope 1", roi, other.log_relative(k), own.log_relative(k))
+    lesion = rois.index("lesion")
+    best = math.log(facts.limit_hu**2 / exposure_s) - _log_of_square(true[lesion])
+    factor("limit of the data", "lesion", other.log_relative(lesion), best)
     add("CNR", rois[0], own.cnr(0))
     if _value(own.cnr(0)) > 0 and _value(other.cnr(0)) > 0:
         factor("CNR", rois[0], _log_square(own.cnr(0)), _log_square(other.cnr(0)))
@@ -331,6 +347,10 @@ def records_of(
 
 def _value(figure: Figure) -> float:
     return figure.value if isinstance(figure, Jackknifed) else figure
+
+
+def _log_of_square(contrast: float) -> float:
+    return 2.0 * math.log(max(abs(float(contrast)), 1e-12))
 
 
 def _log_square(figure: Figure) -> Figure:

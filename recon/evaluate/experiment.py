@@ -13,8 +13,8 @@ import pickle
 import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.evaluate.draws import Draws
+from recon.evaluate.energies import BINS, EnergyDraws, with_bins
 from recon.evaluate.estimates import Known, Record, records_of
 from recon.evaluate.measure import BLOCK, Measurement, Reader, Readings, kept_as
 from recon.evaluate.methods import Method, method_of
@@ -122,6 +123,13 @@ def evaluate(
             raise ValueError(
                 f"{kind}: {', '.join(sorted(twice))} given twice; give one of them another name"
             )
+    weighted = [m.name for m in run if m.energies is not None]
+    if weighted and not any(t.has_energies for t in todo):
+        painted = ", ".join(t.name for t in todo)
+        raise ValueError(
+            f"{', '.join(weighted)}: {painted} paint their tissues in HU and have no energies; "
+            "energies= takes tasks whose scene is made of bodies alone"
+        )
     exposures = (
         None
         if exposures_s is None
@@ -173,13 +181,21 @@ def _listed(what: Any) -> Sequence[Any]:
 
 
 def _everyone(task: Task, methods: Sequence[Method]) -> list[Method]:
-    """The methods after the task's reference."""
+    """The methods after the task's reference; of tissues painted in HU there are no energies."""
     reference = method_of(task.reference)
     if not reference.is_fbp:
         raise ValueError(
             f"task {task.name}: factors are quoted against FBP, got {reference.name!r}"
         )
-    return [reference, *(m for m in methods if m.name != reference.name)]
+    for method in methods:
+        if method.energies is not None and not task.has_energies:
+            log.warning(
+                "%s is left out of task %s, whose tissues are painted in HU: they have no energies",
+                method.name,
+                task.name,
+            )
+    fit = (m for m in methods if m.energies is None or task.has_energies)
+    return [reference, *(m for m in fit if m.name != reference.name)]
 
 
 # --- jobs -----------------------------------------------------------------------------------------
@@ -238,10 +254,12 @@ def _jobs(
     task, seed, store = bench.draws.task, bench.draws.seed, bench.draws.store
     place, first = f"{task.name}/", f"{task.name}: facts"
     jobs, scans = [], {f"{task.name}: scan, signal {s}": s for s in ("present", "absent")}
+    in_bins = {f"{task.name}: scan in energy bins, signal {s}": s for s in ("present", "absent")}
+    weighted = False
     if not store.has("facts", f"1 {task.fingerprint}"):
         jobs += [Job(name, _do, (given, "scan", signal)) for name, signal in scans.items()]
         jobs.append(Job(first, _do, (given, "facts"), (f"{place}facts.npz",), tuple(scans)))
-    wanted = list(dict.fromkeys(m.kernels[0] for m in methods if m.is_fbp))
+    wanted = _kernels(methods, None)
     exact = [
         kernel for kernel in wanted if not store.has(f"exact_{kernel}", f"1 {task.fingerprint}")
     ]
@@ -268,6 +286,7 @@ def _jobs(
                 ]
                 if not asked:
                     continue
+                weighted |= any(bench.methods[name].energies is not None for name in asked)
                 pieces = (
                     f"{place}{kept[m.name][0]}/{part}.npz" for m in group for part in _parts(m, k)
                 )
@@ -282,13 +301,15 @@ def _jobs(
                         name,
                         _do,
                         (given, "block", exposure, asked, k),
-                        (*pieces, f"{place}sigma_*.npz"),
-                        (first, known) if k else (first,),
+                        (*pieces, f"{place}*sigma_*.npz", f"{place}energies_*.npz"),
+                        (first, *in_bins, known) if k else (first, *in_bins),
                         seconds=seconds,
                         mib=_MIB,
                         bytes=kb,
                     )
                 )
+    if weighted:
+        jobs += [Job(name, _do, (given, "bins", signal)) for name, signal in in_bins.items()]
     return jobs
 
 
@@ -321,6 +342,13 @@ def _estimate(task: Task, methods: Sequence[Method], n: int) -> tuple[float, flo
     )
 
 
+def _kernels(methods: Sequence[Method], energies: str | None, exact: bool = True) -> list[str]:
+    """Kernels of FBP that methods with an option ``energies`` ask for; ``exact``: whose noise is
+    exact."""
+    asked = (m for m in methods if m.energies == energies and (m.is_fbp or not exact))
+    return list(dict.fromkeys(k for m in asked for k in (m.kernels[:1] if exact else m.kernels)))
+
+
 class _Bench:
     """A task with the methods that are measured at it: its draws, what reads their volumes, and
     what its jobs do."""
@@ -334,17 +362,35 @@ class _Bench:
         kernels: Sequence[str] | None = None,
     ) -> None:
         if kernels is None:
-            kernels = [k for m in methods for k in m.kernels]
+            kernels = _kernels(methods, None, exact=False)
         self.draws = Draws(task, Store(folder / task.name), seed, kernels)
         self.methods = {m.name: m for m in methods}
+        self._weighted = dict[str, Draws]()
+        self._readers = dict[str | None, Reader]()
 
-    @cached_property
-    def reader(self) -> Reader:
-        """Of the task's volumes; it needs the facts."""
-        return Reader(self.draws.task, self.draws.task.truth(self.draws.facts))
+    def draws_of(self, energies: str | None) -> Draws:
+        """The realisations that methods with an option ``energies`` are given."""
+        if energies is None:
+            return self.draws
+        if energies not in self._weighted:
+            kernels = _kernels(list(self.methods.values()), energies, exact=False)
+            self._weighted[energies] = EnergyDraws(self.draws, energies, kernels)
+        return self._weighted[energies]
+
+    def reader_of(self, energies: str | None) -> Reader:
+        """Of their volumes; it needs the facts."""
+        if energies not in self._readers:
+            draws = self.draws_of(energies)
+            self._readers[energies] = Reader(draws.task, draws.task.truth(draws.facts))
+        return self._readers[energies]
 
     def scan(self, signal: str) -> None:
         self.draws.task.prepare(self.draws.store, signal)
+
+    def bins(self, signal: str) -> None:
+        task = self.draws.task
+        in_bins = replace(task, scanner=with_bins(task.scanner))
+        in_bins.scan(Store(self.draws.store.folder / BINS), signal)
 
     def facts(self) -> None:
         _ = self.draws.facts
@@ -359,22 +405,34 @@ class _Bench:
         for name in names:
             measurement = self.measurement(name, exposure)
             if k:
-                measurement.block(k, pairs)
+                measurement.block(k, partial(pairs, self.methods[name].energies))
 
     def readings(self, name: str, exposure: float, n: int) -> Readings:
         """Of a method at an exposure, from its pieces; one that cannot be read is computed."""
         measurement = self.measurement(name, exposure)
         for k in _blocks(n):
-            measurement.block(k, self._pairs(exposure, k))
+            measurement.block(k, partial(self._pairs(exposure, k), self.methods[name].energies))
         return measurement.readings()
 
     def measurement(self, name: str, exposure: float) -> Measurement:
         """Of a method at an exposure."""
-        return Measurement(self.methods[name], self.draws, self.reader, exposure)
+        method = self.methods[name]
+        draws, reader = self.draws_of(method.energies), self.reader_of(method.energies)
+        return Measurement(method, draws, reader, exposure)
 
-    def _pairs(self, exposure: float, k: range) -> Callable[[], list[Any]]:
-        """Realisations, drawn once for all methods, if one needs them."""
-        return cache(lambda: [self.draws.draw(exposure, i) for i in k])
+    def _pairs(self, exposure: float, k: range) -> Callable[[str | None], list[Any]]:
+        """Realisations for an option ``energies``, drawn once for all methods, if one needs
+        them."""
+        return cache(lambda energies: [self.draws_of(energies).draw(exposure, i) for i in k])
+
+    def contrasts(self, energies: str | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """True contrasts of the ROIs: what the signal adds, and what there is without it, HU."""
+        truth, regions = self.reader_of(energies).truth, self.draws.task.regions
+        added, absent = (
+            np.array([float((hu.double() * (b - a)).sum()) for a, b in regions.values()])
+            for hu in (truth[0] - truth[1], truth[1])
+        )
+        return added, absent
 
 
 @lru_cache(maxsize=1)
@@ -392,25 +450,22 @@ def _do(folder: Path, given: _Bench | bytes, job: str, *args: Any) -> None:
 
 def _read(bench: _Bench, exposures: Sequence[float], n: int) -> tuple[list[Record], TaskResult]:
     """The figures of a task, from the pieces of its jobs."""
-    draws, reader, facts, truth = bench.draws, bench.reader, bench.draws.facts, bench.reader.truth
-    task, everyone = draws.task, list(bench.methods.values())
+    reader, task, everyone = bench.reader_of(None), bench.draws.task, list(bench.methods.values())
     reference = everyone[0]
-    true, absent = (
-        np.array([float((hu.double() * (b - a)).sum()) for a, b in task.regions.values()])
-        for hu in (truth[0] - truth[1], truth[1])
-    )
+    kinds = list(dict.fromkeys(m.energies for m in everyone))
+    contrasts = {e: bench.contrasts(e) for e in kinds}
+    at_1_s = {e: bench.draws_of(e).exact_covariances(_kernels(everyone, e)) for e in kinds}
     records: list[Record] = []
     volumes = {}
-    at_1_s = draws.exact_covariances(
-        list(dict.fromkeys(m.kernels[0] for m in everyone if m.is_fbp))
-    )
     for exposure in exposures:
         found = {m.name: bench.readings(m.name, exposure, n) for m in everyone}
         base = found[reference.name]
-        control = Known(at_1_s[reference.kernels[0]] / exposure, base.clean_rois, base.rois)
+        known = at_1_s[reference.energies][reference.kernels[0]] / exposure
+        control = Known(known, base.clean_rois, base.rois)
         for method in everyone:
             own = found[method.name]
-            exact = at_1_s[method.kernels[0]] / exposure if method.is_fbp else None
+            e = method.energies
+            exact = at_1_s[e][method.kernels[0]] / exposure if method.is_fbp else None
             volumes[method.name, exposure] = (own.first, own.first_clean)
             records += records_of(
                 task.name,
@@ -419,14 +474,15 @@ def _read(bench: _Bench, exposures: Sequence[float], n: int) -> tuple[list[Recor
                 own,
                 base,
                 control,
-                facts,
-                true,
-                absent,
+                bench.draws_of(e).facts,
+                *contrasts[e],
                 reader.rois,
                 exact,
+                contrasts[reference.energies][0],
             )
-    true_hu = dict(zip(reader.rois, true.tolist(), strict=True))
-    return records, TaskResult(task, facts, true_hu, truth[0].numpy(), volumes)
+    true_hu = dict(zip(reader.rois, contrasts[reference.energies][0].tolist(), strict=True))
+    truth = reader.truth[0].numpy()
+    return records, TaskResult(task, bench.draws.facts, true_hu, truth, volumes)
 
 
 def measured_before(
@@ -497,7 +553,9 @@ def measured_before(
 def _finished(
     task: Task, method: Method, exposures_s: Any, n: int, seed: int, folder: Path
 ) -> bool:
-    """Whether all pieces of a method are there."""
+    """Whether all pieces of a method are there, of a task that it is measured at."""
+    if method.energies is not None and not task.has_energies:
+        return True
     store = Store(folder / task.name)
     blocks = [range(0), *_blocks(n)]
     for exposure in task.exposures_s if exposures_s is None else _listed(exposures_s):

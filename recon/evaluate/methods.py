@@ -11,6 +11,9 @@ A method's name says all:
   :mod:`recon.filters` such as ``perona-malik``, or ``package.module:function``, a denoiser as below
   or a network of a user's own;
 * ``mbir:weights=FILE,network=package.module:Class``: weights of a network of a user's own;
+* any of them with ``energies=CONTRAST`` among its options (``fbp:soft,energies=iodine``): of the
+  energy bins of a photon-counting scanner, summed with the weights that show the contrast best
+  (:mod:`recon.evaluate.energies`);
 * ``FILTER@BASE``: a filter of :mod:`recon.filters` after a linear method, ``bilateral@fbp:detail``;
 * ``package.module:function``: a function of ``(scan, grid)`` that gives a volume in HU; with
   ``@BASE`` a denoiser, a function of ``(volume)`` or ``(volume, sigma)`` in HU, tensors ``(z, y,
@@ -42,7 +45,7 @@ from recon.mbir.mbir import Mbir
 from recon.mbir.network import bilateral_prior
 from recon.mbir.priors import PlugAndPlay, prior_of
 from recon.mbir.weights_io import digest
-from recon.names import filter_name, is_module_name, loaded, mbir_options
+from recon.names import filter_name, is_module_name, loaded, mbir_options, split_energies
 from recon.vessel.known import known_vessel
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
@@ -112,6 +115,8 @@ class Method:
         kernels: of FBP that it asks a draw for.
         is_fbp: its volume is FBP with the first of them: means and variances of its ROIs are exact.
         network: it is this MBIR, whose own response to noise controls what is drawn.
+        energies: the contrast for which it is given weighted energy bins
+            (:mod:`recon.evaluate.energies`); None: the plain sum of the counts.
         made: a function of a module and its arguments that make the same method in another process;
             None: it is sent as it is, which a ``run`` that is no function of a module does not
             allow.
@@ -123,6 +128,7 @@ class Method:
     kernels: tuple[str, ...] = ()
     is_fbp: bool = False
     network: Mbir | None = None
+    energies: str | None = None
     made: tuple[Callable[..., Any], tuple[Any, ...]] | None = None
 
     def __reduce__(self) -> Any:
@@ -143,6 +149,11 @@ def method_of(spec: Any) -> Method:
     if callable(spec):
         return _of_function(getattr(spec, "__name__", "function"), spec)
     if isinstance(spec, str):
+        plain, energies = split_energies(spec)
+        if energies is not None:
+            check_method(spec)
+            found = _named(plain)
+            return replace(found, name=spec, energies=energies, made=(method_of, (spec,)))
         return replace(_named(spec), made=(method_of, (spec,)))
     raise TypeError(
         f"a method must be a name or a function of (scan, grid), got {type(spec).__name__}"
@@ -151,10 +162,10 @@ def method_of(spec: Any) -> Method:
 
 def names_module(spec: str) -> bool:
     """Whether a method's name is that of a function of a module, which is imported."""
-    head, _, base = spec.partition("@")
+    head, _, base = split_energies(spec)[0].partition("@")
     if base:
         return filter_name(head) not in FILTERS
-    name, _, rest = spec.partition(":")
+    name, _, rest = head.partition(":")
     if name == "mbir":
         given = [part.partition("=") for part in rest.split(",")]
         return any(key in ("prior", "network") and is_module_name(value) for key, _, value in given)

@@ -8,7 +8,16 @@ from __future__ import annotations
 from importlib import resources
 from pathlib import Path
 
-from recon.names import FILTERS, KERNELS, filter_name, is_module_name, mbir_options, meant_method
+from recon.names import (
+    CONTRASTS,
+    FILTERS,
+    KERNELS,
+    filter_name,
+    is_module_name,
+    mbir_options,
+    meant_method,
+    split_energies,
+)
 from torchpcct.validate import choice
 
 __all__ = ["TASKS", "check_method", "check_task"]
@@ -39,6 +48,9 @@ def check_method(spec: str) -> None:
         ValueError, TypeError: an unknown name, kernel or option, with those that there are.
         FileNotFoundError: weights or a folder that do not exist.
     """
+    spec, energies = split_energies(spec)
+    if energies is not None:
+        _check_energies(spec, energies)
     head, _, base = spec.partition("@")
     if base:
         check_method(base)
@@ -64,3 +76,23 @@ def check_method(spec: str) -> None:
         raise ValueError(f"unknown method {spec!r}: one of {known}{meant_method(spec)}")
     elif name == "pwls" and rest:
         raise ValueError(f"pwls has no options, got {spec!r}")
+
+
+def _check_energies(method: str, energies: str) -> None:
+    """Refuse what is no contrast, and methods that are given no scans."""
+    if method.startswith("files:"):
+        raise ValueError(
+            f"energies= weighs the scans that a method is given, and {method!r} is given none: "
+            "leave it out"
+        )
+    if energies in ("", "task", *CONTRASTS):
+        return
+    names = energies.split("/")
+    if len(names) != 2:
+        raise ValueError(
+            f"energies= must be task, {', '.join(CONTRASTS)} or two materials A/B, got {energies!r}"
+        )
+    from torchpcct.scene.materials import material  # loads numpy
+
+    for name in names:
+        material(name)

@@ -25,7 +25,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -139,6 +139,9 @@ class Task:
     rois: Mapping[str, Pair] = field(default_factory=dict)
     tolerance_hu: float = 0.5
 
+    has_energies: ClassVar[bool] = True
+    """Whether the scene can be scanned in energy bins: all its tissues are materials."""
+
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}", str(self.name)):
             raise ValueError(
@@ -245,9 +248,10 @@ class Task:
     def facts(self, store: Store) -> Facts:
         """Values of the tissues and the limit of the data; bodies of one material count as one
         tissue."""
-        return self._facts_of(*self.scans(store))
+        return self.facts_of(*self.scans(store))
 
-    def _facts_of(self, present: Scan, absent: Scan) -> Facts:
+    def facts_of(self, present: Scan, absent: Scan) -> Facts:
+        """The same of noise-free scans with and without the signal."""
         seen = SomeViews(present)
         maps = seen.path_lengths(self, list(self._groups.values()))
         information = seen.information(maps)

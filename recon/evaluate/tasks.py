@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -232,6 +232,7 @@ class VesselTask(Task):
     """
 
     direction: str = "tilted"
+    has_energies: ClassVar[bool] = False
 
     @cached_property
     def _vessel(self) -> Vessel:
@@ -255,7 +256,7 @@ class VesselTask(Task):
         paths = [self.scan_file(store, name) for name in ("present", "absent")]
         if not all(p.exists() for p in paths):
             straight = self._along_z(store, "present"), self._along_z(store, "absent")
-            facts = self._facts_of(*straight)
+            facts = self.facts_of(*straight)
             values = {
                 ("core" if t == "signal" else t): v
                 for t, v in zip(facts.tissues, facts.values_hu, strict=True)
@@ -273,7 +274,7 @@ class VesselTask(Task):
 
     def facts(self, store: Store) -> Facts:
         """Of the vessel along z: values and limit of other directions differ little."""
-        return self._facts_of(self._along_z(store, "present"), self._along_z(store, "absent"))
+        return self.facts_of(self._along_z(store, "present"), self._along_z(store, "absent"))
 
     @cached_property
     def shares(self) -> dict[str, Floats]:
@@ -295,6 +296,8 @@ class _PaintedTask(Task):
     The scene is the patient alone, round about the axis. The tissues are painted over it on voxels
     half as large as the inset's, projected, and change the patient's counts.
     """
+
+    has_energies: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         both = set(self.tissues_hu) & set(self.scene.names)

@@ -148,6 +148,12 @@ def evaluate_scans(
         ]
         grid = VolumeGrid((1, *grid.shape), (grid.spacing[0], *grid.spacing), (0.0, *grid.center))
     names = [method_of(m) for m in (methods if isinstance(methods, list | tuple) else [methods])]
+    weighted = [m.name for m in names if m.energies is not None]
+    if weighted:
+        raise ValueError(
+            f"{', '.join(weighted)}: energies= weighs the bins of simulated scans; weigh those of "
+            "measured ones before, scan.weighted(torchpcct.spectral.bin_weights(…))"
+        )
     draw = np.random.default_rng(seed)
     rows = []
     for k in range(n):

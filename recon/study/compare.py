@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,6 +20,7 @@ from recon.evaluate.experiment import Evaluation, evaluate
 from recon.evaluate.report import plain, task_sections
 from recon.evaluate.tasks import read_task
 from recon.jobs.store import Pieces
+from recon.study.energies import VIEWS, energy_rows
 from recon.study.figures import extent
 from recon.study.paper import facts as paper
 from recon.study.study import Measured, Progress, StudySettings, silent
@@ -48,6 +50,8 @@ class Settings(StudySettings):
         seed: of the first.
         views: views per rotation.
         exposures_s: of the scans in s.
+        energies_views: of the scan for what the weights of energy bins bring
+            (:mod:`recon.study.energies`); 0: it is not computed.
     """
 
     methods: tuple[str, ...] = (
@@ -63,16 +67,18 @@ class Settings(StudySettings):
     seed: int = 0
     views: int = paper.FULL_VIEWS["PCCT"]
     exposures_s: tuple[float, ...] = (0.35, 2.0)
+    energies_views: int = VIEWS
 
     # An eighth of the views, 8 realisations, no PWLS: some minutes on two slow cores.
     QUICK: ClassVar[Mapping[str, Any]] = {
         "views": 246,
         "n": 8,
+        "energies_views": 48,
         "methods": ("fbp:soft", "bilateral@fbp:detail", "mbir"),
     }
 
     def __post_init__(self) -> None:
-        self.check_whole(n=8, seed=0, views=8)
+        self.check_whole(n=8, seed=0, views=8, energies_views=0)
         numbers("exposures_s", self.exposures_s, positive=True, unit="s")
         if not self.methods:
             raise ValueError("methods must name at least one method")
@@ -84,7 +90,8 @@ def measure(
     """Simulate, reconstruct, measure; see :mod:`recon.study.study`."""
     s = settings
     task = replace(read_task("plaque"), scanner=presets.pcct(views=s.views))
-    kept = Pieces(folder, settings).folder("evaluate")
+    pieces = Pieces(folder, settings)
+    kept = pieces.folder("evaluate")
     found = evaluate(
         task,
         s.methods,
@@ -102,6 +109,9 @@ def measure(
         "tables": "\n\n".join(task_sections(found)),
         "peak_memory_gib": _peak_memory_gib(),
     }
+    if s.energies_views:
+        rows = partial(energy_rows, task, views=s.energies_views, progress=progress)
+        data["energies"] = pieces("energies", rows)
     return Measured(s, data, found)
 
 

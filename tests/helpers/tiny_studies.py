@@ -15,6 +15,7 @@ TINY: dict[str, dict[str, Any]] = {
         "views": 48,
         "methods": ("fbp:soft", "gaussian@fbp:soft"),
         "exposures_s": (2.0,),
+        "energies_views": 0,
     },
     "phantom": {"voxel_mm": 0.05, "sections": 2, "energies_kev": (55.0, 64.0)},
     "detector": {"photons": 4000, "dead_times_ns": (50.0,), "charge_sharing": (0.1,)},

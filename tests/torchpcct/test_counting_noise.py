@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy import stats
 
-from torchpcct.counting_noise import normal, poisson, thinned
+from torchpcct.counting_noise import normal, poisson, split, thinned
 
 
 def assert_poisson(draws, mean):
@@ -141,3 +141,31 @@ def test_infinite_expectations_are_no_numbers():
     assert torch.isnan(
         poisson(torch.full((1, 2), 1e300, dtype=torch.float64), [0], 0, scale=1e10)
     ).all()
+
+
+@pytest.mark.parametrize("total", [0.8, 40.0, 16070.0])
+def test_bins_that_a_sum_is_split_into_are_independent_poisson_counts(total):
+    """Their sum is what was given; each is Poisson of its share, and none tells of another."""
+    n, shares = 100_000, torch.tensor([0.55, 0.05, 0.0, 0.4], dtype=torch.float64)
+    given = poisson(torch.full((1, n), total, dtype=torch.float64), [0], seed=3)
+    expected = (total * shares).reshape(-1, 1, 1).expand(-1, 1, n)
+    bins = split(given, expected, [0], seed=3)
+    assert torch.equal(bins.sum(0), given)
+    assert (bins[2] == 0).all()
+    for k in (0, 1, 3):
+        assert_poisson(bins[k].numpy().ravel(), total * float(shares[k]))
+    seen = np.corrcoef(bins[[0, 1, 3], 0].numpy())
+    assert np.abs(seen[np.triu_indices(3, 1)]).max() < 4.5 / np.sqrt(n)
+    assert torch.equal(split(given, expected, [0], seed=3), bins)
+    assert not torch.equal(split(given, expected, [0], seed=4), bins)
+
+
+def test_bins_of_nothing_and_of_what_is_no_count():
+    counts = torch.tensor([[3.0, 0.0, -1.0, 2.0]])
+    expected = torch.tensor([[[1.0, 0.0, 1.0, 0.0]], [[0.0, 0.0, 1.0, 0.0]]])
+    bins = split(counts, expected, [0], seed=0)
+    assert bins[:, 0, 0].tolist() == [3.0, 0.0]
+    assert bins[:, 0, 1].tolist() == [0.0, 0.0]
+    assert bins[0, 0, 2:].isnan().all()
+    with pytest.raises(ValueError, match=r"\(bins, …\)"):
+        split(counts, expected[0], [0], seed=0)

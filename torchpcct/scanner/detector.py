@@ -54,6 +54,16 @@ electrons per keV (public CatSim/XCIST default)."""
 _MODES = ("counting", "spectral")
 
 
+def _halves(nodes: int) -> tuple[Floats, Floats]:
+    """Gauss–Legendre nodes and weights of the ratio at which charge is split, 0…1; the nodes are
+    symmetric: reversed, they are those of the other part."""
+    parts, weights = np.polynomial.legendre.leggauss(nodes)
+    return (parts + 1) / 2, weights / 2
+
+
+_PARTS = _halves(24)
+
+
 @runtime_checkable
 class Detector(Protocol):
     """What :class:`torchpcct.scanner.Scanner` needs of a detector."""
@@ -189,19 +199,12 @@ class SiliconDetector:
         both at once."""
         energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))
         thresholds = np.atleast_1d(np.asarray(thresholds_kev, dtype=np.float64))
-        photo, compton = self.interaction(energies)
-        electron, probability = recoil(energies)
-        # All deposits of one photon energy with their probabilities: the photopeak first, then the
-        # Compton continuum.
-        deposit = np.concatenate([energies[:, None], electron], axis=1)
-        chance = np.concatenate([photo[:, None], compton[:, None] * probability], axis=1)
+        deposit, chance = self._deposits(energies)
         out = np.empty((thresholds.size, energies.size))
-        parts, weights = np.polynomial.legendre.leggauss(24)
-        parts, weights = (parts + 1) / 2, weights / 2
+        parts, weights = _PARTS
         for i, t in enumerate(thresholds):
             whole = ndtr((deposit - t) / self.sigma_kev)
             if self.charge_sharing:
-                # The nodes are symmetric: reversed, they are those of the other part.
                 one = [ndtr((u * deposit - t) / self.sigma_kev) for u in parts]
                 shared = sum(
                     w * (2.0 * a - both * a * b)
@@ -210,6 +213,15 @@ class SiliconDetector:
                 whole = (1 - self.charge_sharing) * whole + self.charge_sharing * shared
             out[i] = (chance * whole).sum(axis=1)
         return out
+
+    def _deposits(self, energies: Floats) -> tuple[Floats, Floats]:
+        """All deposits of each photon energy, keV, with their probabilities, ``(E, deposits)``: the
+        photopeak first, then the Compton continuum."""
+        photo, compton = self.interaction(energies)
+        electron, probability = recoil(energies)
+        deposit = np.concatenate([energies[:, None], electron], axis=1)
+        chance = np.concatenate([photo[:, None], compton[:, None] * probability], axis=1)
+        return deposit, chance
 
     def response(self, energies_kev: ArrayLike) -> Floats:
         """Expected counts per incident photon, ``(bins, E)`` float64."""
@@ -222,6 +234,40 @@ class SiliconDetector:
     def variance(self, energies_kev: ArrayLike) -> Floats:
         """Equal to :meth:`response`: counts are Poisson."""
         return self.response(energies_kev)
+
+    def joint_counts(self, energies_kev: ArrayLike) -> Floats:
+        """Expected products of the counts that one photon leaves in two bins, in all cells
+        together, per incident photon: ``(bins, bins, E)``.
+
+        Without charge sharing a photon counts once, and the matrix is diagonal, :meth:`response`.
+        With it both parts of a photon may count: Σ_kl w_k w_l of this matrix is the variance of a
+        sum with weights over many cells, where the counts of two neighbours are one photon's.
+        """
+        energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))
+        deposit, chance = self._deposits(energies)
+        thresholds = self.thresholds_kev[: self.bins]
+        out = np.zeros((self.bins, self.bins, energies.size))
+
+        def in_bins(values: Floats) -> list[Floats]:
+            above = [ndtr((values - t) / self.sigma_kev) for t in thresholds]
+            return [a - b for a, b in itertools.pairwise([*above, np.zeros_like(values)])]
+
+        for k, whole_ in enumerate(in_bins(deposit)):
+            out[k, k] = (1.0 - self.charge_sharing) * (chance * whole_).sum(1)
+        if not self.charge_sharing:
+            return out
+        parts, weights = _PARTS
+        both = [in_bins(u * deposit) for u in parts]
+        for first, second, w in zip(both, both[::-1], weights, strict=True):
+            for k, one in enumerate(first):
+                # each part by itself, and one together with the other, in either order
+                scaled = self.charge_sharing * w * 2.0 * chance * one
+                out[k, k] += scaled.sum(1)
+                for m, other in enumerate(second):
+                    product = 0.5 * (scaled * other).sum(1)
+                    out[k, m] += product
+                    out[m, k] += product
+        return out
 
     @functools.cached_property
     def segment_mm(self) -> tuple[float, ...]:

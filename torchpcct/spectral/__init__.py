@@ -27,7 +27,12 @@ from torchpcct.spectral.vmi import (
     vmi_noise,
     vmi_weights,
 )
-from torchpcct.spectral.weighting import BinWeights, bin_weights, weighting_gain
+from torchpcct.spectral.weighting import (
+    BinWeights,
+    bin_weights,
+    contrast_information,
+    weighting_gain,
+)
 
 __all__ = [
     "MMD_TISSUES",
@@ -39,6 +44,7 @@ __all__ = [
     "VmiCurve",
     "bin_weights",
     "clean",
+    "contrast_information",
     "cramer_rao",
     "decompose",
     "decompose_scan",

@@ -34,7 +34,7 @@ from torchpcct.scanner.scanner import PILE_UP_ORDER, Scanner
 from torchpcct.scene.materials import MATERIALS, Material, material
 from torchpcct.validate import checked, choice, number, reals
 
-__all__ = ["BinWeights", "bin_weights", "weighted_scan", "weighting_gain"]
+__all__ = ["BinWeights", "bin_weights", "contrast_information", "weighted_scan", "weighting_gain"]
 
 Floats = NDArray[np.float64]
 
@@ -154,6 +154,54 @@ def weighting_gain(
     )
 
 
+@checked
+def contrast_information(
+    scanner: Scanner,
+    contrast: Sequence[Material | str],
+    behind: Mapping[Any, float] | None = None,
+    weights: Any = "bins",
+) -> Floats:
+    """Squared signal-to-noise ratio of a small contrast that is larger than a cell, per mm² of its
+    thickness and mAs: what detectors with other thresholds, resolution or charge sharing are
+    compared by.
+
+    A photon whose charge is shared between two cells may count in both. Over many cells that is one
+    photon read twice, with the variance of :meth:`SiliconDetector.joint_counts
+    <torchpcct.scanner.SiliconDetector.joint_counts>`; simulated scans draw all cells and bins
+    independently, which takes it for two.
+
+    Args:
+        scanner: with silicon in energy bins.
+        contrast, behind: of :func:`bin_weights`.
+        weights: ``(bins, columns)``; ``"bins"``: the best ones, M⁻¹ s of the variances M of the
+            counts of all cells together; ``"sum"``: 1 in all bins.
+
+    Returns:
+        ``(columns,)`` float64, mm⁻² mAs⁻¹.
+
+    Raises:
+        ValueError, TypeError: as of :func:`weighting_gain`.
+    """
+    counted, change, _, _ = _photons(scanner, contrast, behind)
+    signal = counted @ change
+    detector: Any = scanner.detector
+    energies, quanta = scanner.quanta()
+    depth = sum(
+        (material(m).attenuation(energies) * t for m, t in (behind or {}).items()),
+        np.zeros(energies.size),
+    )
+    variance = np.einsum(
+        "kle,ce->ckl", detector.joint_counts(energies), quanta * np.exp(-depth), optimize=True
+    )
+    if isinstance(weights, str):
+        if choice("weights", weights, ("bins", "sum")) == "bins":
+            best = np.linalg.solve(variance, signal.T[..., None])[..., 0]
+            return np.asarray((best * signal.T).sum(-1))
+        weights = np.ones(signal.shape)
+    w = _values(weights, signal.shape)
+    return np.asarray((w * signal).sum(0) ** 2 / np.einsum("kc,ckl,lc->c", w, variance, w))
+
+
 def _photons(
     scanner: Scanner, contrast: Any, behind: Any
 ) -> tuple[Floats, Floats, tuple[str, ...], dict[str, float]]:
@@ -244,7 +292,6 @@ def weighted_scan(scan: Any, weights: Any, scanner: Scanner | None = None) -> An
             "correction: give scanner=, or weights of bin_weights"
         )
     _require_scanner(scan, scanner)
-    per_bin = torch.from_numpy(values)[:, None].to(scan.counts.dtype)  # (bins, 1, columns)
     silent = [k for k in range(bins) if values[k].any() and not float(scan.counts[k].amax()) > 0]
     if silent:
         raise ValueError(
@@ -253,15 +300,7 @@ def weighted_scan(scan: Any, weights: Any, scanner: Scanner | None = None) -> An
             "the detector"
         )
 
-    def summed(readings: Tensor, power: int, cells: bool = False) -> Tensor:
-        """Σ_k w_k^power N_k of readings, or of cells (rows, columns)."""
-        total = torch.zeros_like(readings[0])
-        for values_, w in zip(readings, per_bin, strict=True):
-            at = w if cells else scan._at_window(w.expand(scan.air.shape[1:]))
-            total.addcmul_(values_, at**power)
-        return total
-
-    first, second = summed(scan.counts, 1), summed(scan.counts, 2)
+    first, second = (weighted_sum(scan, scan.counts, values**power) for power in (1, 2))
     dead = scan.dead
     if dead is not None:
         used = torch.from_numpy(values > 0).any(1)
@@ -272,7 +311,7 @@ def weighted_scan(scan: Any, weights: Any, scanner: Scanner | None = None) -> An
         mean, square = moments
     else:
         mean, square = first, second
-    air, air_square = summed(scan.air, 1, cells=True), summed(scan.air, 2, cells=True)
+    air, air_square = (_summed_cells(scan.air, values**power) for power in (1, 2))
     in_air = scan._at_window(air_square / air).expand(first.shape)
     quantum = torch.where((mean > 0) & (square > 0), square / mean, in_air)
     made = {
@@ -284,7 +323,7 @@ def weighted_scan(scan: Any, weights: Any, scanner: Scanner | None = None) -> An
         scan,
         counts=first,
         air=air,
-        surround=None if scan.surround is None else summed(scan.surround, 1, cells=True),
+        surround=None if scan.surround is None else _summed_cells(scan.surround, values),
         linearisation=_linearisation(scanner, values),
         counting=False,
         quantum=quantum,
@@ -292,6 +331,24 @@ def weighted_scan(scan: Any, weights: Any, scanner: Scanner | None = None) -> An
         dead=dead,
         info={**scan.info, "energies": made},
     )
+
+
+def weighted_sum(scan: Any, readings: Tensor, weights: Floats) -> Tensor:
+    """Σ_k w_k N_k of readings ``(bins, views, r, c)`` of a scan's cells, ``(views, r, c)``."""
+    total = torch.zeros_like(readings[0])
+    for values, w in zip(readings, _per_cell(weights, readings), strict=True):
+        total.addcmul_(values, scan._at_window(w.expand(scan.air.shape[1:])))
+    return total
+
+
+def _summed_cells(cells: Tensor, weights: Floats) -> Tensor:
+    """Σ_k w_k N_k of ``(bins, rows, columns)``."""
+    return (cells * _per_cell(weights, cells)).sum(0)
+
+
+def _per_cell(weights: Floats, like: Tensor) -> Tensor:
+    """``(bins, 1, columns)``, to broadcast over rows."""
+    return torch.from_numpy(weights)[:, None].to(like.dtype)
 
 
 def _require_scanner(scan: Any, scanner: Scanner) -> None:

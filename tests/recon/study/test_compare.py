@@ -1,15 +1,19 @@
 """The comparison at small scale, and the answer that it gives."""
 
+import json
 import math
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
-from tiny_studies import assert_report_is_whole
+from tiny_studies import INSERT, assert_report_is_whole
 
 from recon.evaluate.report import page
+from recon.evaluate.tasks import read_task
 from recon.study.compare import claim, dose_chart
-from recon.study.report import aligned, render
+from recon.study.energies import energy_rows
+from recon.study.report import TEMPLATES, aligned, render
 
 
 @pytest.mark.extended
@@ -167,3 +171,30 @@ def test_no_claim_without_both_exposures():
     assert data["claim"] is None
     assert "5.7" not in answer(data)
     assert answer({**data, "records": []}) == ""
+
+
+def test_what_the_weights_of_energy_bins_bring(tmp_path):
+    """Exact, 97 % of the limit or more; no image at one energy, and no mix of the two basis images,
+    is better than the weights where the contrast is one that the basis holds."""
+    (tmp_path / "insert.yaml").write_text(INSERT, encoding="utf-8")
+    task = read_task(tmp_path / "insert.yaml")
+    scene = task.scene.replace_material("insert", "adipose")
+    (row,) = energy_rows(replace(task, scene=scene), [("insert", "patient")], views=16)
+    assert 1.02 < row["limit"] < row["energies"]
+    assert 0.97 * row["limit"] < row["weights"] < 1.005 * row["limit"]
+    assert row["vmi"] <= row["vmi_limit"] < 1.005 * row["weights"]
+    assert 40 < row["vmi_kev"] < 80
+
+
+def test_the_committed_rows_are_told_with_their_sign():
+    """The factors of the committed report, in its text and in the README."""
+    root = TEMPLATES.parents[2]
+    report = json.loads((root / "notebooks/compare/report.json").read_text(encoding="utf-8"))
+    rows = {row["contrast"][0]: row for row in report["energies"]}
+    assert set(rows) == {"lumen", "fibrous", "core"}
+    for row in rows.values():
+        assert row["weights"] > 0.97 * row["limit"]
+    text = render("compare", report)
+    assert re.search(r"lumen against fibrous +\| +1\.49 \|", text)
+    readme = " ".join((root / "README.md").read_text(encoding="utf-8").split())
+    assert f"{rows['lumen']['weights']:.2f} times the dose for the lumen" in readme

@@ -14,7 +14,7 @@ from torchpcct import Scan
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S
 from torchpcct.scanner import SiliconDetector, presets
 from torchpcct.scene.materials import calcification, material
-from torchpcct.spectral import BinWeights, bin_weights, weighting_gain
+from torchpcct.spectral import BinWeights, bin_weights, contrast_information, weighting_gain
 
 SCANNER = presets.pcct(views=40, rows=6, columns=48, mode="spectral")
 LUMEN = ("blood_iodine", "fibrous_tissue")
@@ -213,6 +213,36 @@ def test_dead_readings_are_those_of_bins_that_weigh(clean, iodine):
     without = np.array(iodine)
     without[0] = 0
     assert torch.equal(noisy.weighted(without, SCANNER).dead, dead[1:].any(0))
+
+
+def test_a_photon_that_counts_in_two_cells_is_one():
+    """Counts of one photon in all bins and cells together, against the photons that count at least
+    once; without charge sharing the bins are independent."""
+    energies = np.arange(20.0, 100.0, 9.0)
+    sharing = SiliconDetector("spectral", charge_sharing=0.3)
+    joint = sharing.joint_counts(energies)
+    np.testing.assert_allclose(joint, joint.swapaxes(0, 1))
+    counts = sharing.response(energies).sum(0)
+    twice = counts - sharing.photons_above(energies, sharing.thresholds_kev[:1])[0]
+    # of 0, 1 or 2 counts the mean square is the mean and twice the chance of 2
+    np.testing.assert_allclose(joint.sum((0, 1)), counts + 2 * twice, rtol=1e-12)
+    alone = SiliconDetector("spectral")
+    diagonal = np.einsum("ij,je->ije", np.eye(8), alone.response(energies))
+    np.testing.assert_allclose(alone.joint_counts(energies), diagonal, atol=1e-15)
+
+    def information(detector, weights):
+        scanner = presets.pcct(views=1, rows=1, columns=3, detector=detector)
+        return contrast_information(scanner, LUMEN, FAT, weights)[1]
+
+    best, plain = (information(alone, w) for w in ("bins", "sum"))
+    assert best / plain == pytest.approx(weighting_gain(SCANNER, LUMEN, FAT)[24], rel=1e-3)
+    shared, plain = (information(sharing, w) for w in ("bins", "sum"))
+    # sharing costs more of what the bins tell than of the plain sum
+    assert 0.6 < shared / best < 0.8
+    assert shared > plain
+    for seed in range(5):
+        weights = np.random.default_rng(seed).uniform(0, 3, (8, 1)) * np.ones(3)
+        assert information(sharing, weights) <= shared
 
 
 def test_what_is_refused(clean, iodine):
