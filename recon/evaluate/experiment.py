@@ -308,9 +308,10 @@ def _jobs(
                         bytes=kb,
                     )
                 )
-    if weighted:
-        jobs += [Job(name, _do, (given, "bins", signal)) for name, signal in in_bins.items()]
-    return jobs
+    if not weighted:
+        return jobs
+    first_of_all = [Job(name, _do, (given, "bins", signal)) for name, signal in in_bins.items()]
+    return [*first_of_all, *jobs]
 
 
 def _blocks(n: int) -> list[range]:

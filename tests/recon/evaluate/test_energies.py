@@ -55,6 +55,7 @@ def found(task, folder):
     return {(r["figure"], r["method"], r["where"]): r for r in records}
 
 
+@pytest.mark.extended
 def test_exact_factor_of_the_weights_alone(task, folder, found):
     """FBP's exact noise of the lesion's contrast beside the limit of one ray, 97 % or more of it;
     drawn by a method that is not known to be linear, and by PWLS."""
@@ -75,6 +76,7 @@ def test_exact_factor_of_the_weights_alone(task, folder, found):
     assert weighted / pwls > 0.85 * limit
 
 
+@pytest.mark.extended
 def test_weighted_volumes_are_in_hu_of_their_own(found):
     """Slope, error and limit are those of weighted noise-free scans: none is larger for the larger
     contrast."""
