@@ -59,7 +59,7 @@ def launch(out, launcher):
         ]
     try:
         for process in started:
-            _, errors = process.communicate(timeout=180)
+            _, errors = process.communicate(timeout=600)
             assert process.returncode == 0, errors
     finally:
         for process in started:
@@ -104,7 +104,7 @@ def test_command_line_under_torchrun(tmp_path):
         "command",
     ]
     process = script(*torchrun, str(tmp_path / "x"), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    out, errors = process.communicate(timeout=180)
+    out, errors = process.communicate(timeout=600)
     assert process.returncode == 0, errors
     assert out.count("weights and card in") == 1
     card = json.loads((tmp_path / "x" / "card.json").read_text())

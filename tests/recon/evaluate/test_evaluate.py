@@ -459,16 +459,14 @@ def test_two_measured_scans(task, folder):
     present, _ = task.scans(Store(folder / task.name))
     scans = [present.with_noise(200.0, k) for k in range(2)]
     names = ["fbp:soft", "gaussian@fbp:ram-lak"]
-    for rows in (
-        evaluate_scans(scans, task.grid, names),
-        evaluate_scans(scans, task.grid, names, n=2, seed=1),
-    ):
-        soft, blurred = rows
-        assert blurred["dose_factor"] == pytest.approx(1.0, abs=0.1)
-        assert blurred["low"] < 1.02
-        assert blurred["high"] > 0.98
-        assert blurred["noise"] < soft["noise"]
-        assert not soft["why"]
+    (alone,) = evaluate_scans(scans, task.grid, names[1])
+    soft, blurred = evaluate_scans(scans, task.grid, names, n=2, seed=1)
+    for row in (alone, blurred):
+        assert row["dose_factor"] == pytest.approx(1.0, abs=0.1)
+        assert row["low"] < 1.02
+        assert row["high"] > 0.98
+    assert blurred["noise"] < soft["noise"]
+    assert not soft["why"]
     with pytest.raises(ValueError, match="two of the same object"):
         evaluate_scans([scans[0], object()], task.grid, "fbp:soft")
     with pytest.raises(ValueError, match="one scan makes one pair"):

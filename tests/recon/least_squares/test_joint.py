@@ -56,7 +56,7 @@ def correlated_noise(f, shape, seed):
 
 @pytest.fixture(scope="module")
 def inset():
-    A, w = problem(views=120, shape=(3, 8, 8), rows=6)
+    A, w = problem(views=40, shape=(3, 8, 8), rows=6)
     w = w * 1e-4  # of line integrals in HU mm
     f = anisotropic(w)
     y = A(tissue(A.grid)) + correlated_noise(f, (), 1)

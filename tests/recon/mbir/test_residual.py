@@ -42,10 +42,10 @@ def bars(shape, hu):
 
 def test_noise_is_left_where_it_is(gram):
     """One in six billion coefficients passes: nothing is put into nearly all volumes of noise."""
-    p = left(gram, torch.zeros(SHAPE), 1.0, batch=100)
+    p = left(gram, torch.zeros(SHAPE), 1.0, batch=50)
     step = filtered(p.b, 1.0 / (p.spectrum() + DAMPING))
     found_of_noise = found(p)
-    assert int(found_of_noise.flatten(1).any(1).sum()) <= 8
+    assert int(found_of_noise.flatten(1).any(1).sum()) <= 4
     assert float(found_of_noise.square().mean()) < 1e-5 * float(step.square().mean())
 
 

@@ -57,7 +57,16 @@ def scanned(g, radius, column, photons, cells, seed):
 
 @pytest.mark.parametrize(
     ("kind", "turn"),
-    [("parallel", turn) for turn in TURNS] + [("flat", "full"), ("curved", "short")],
+    [
+        ("parallel", "half"),
+        *(
+            pytest.param("parallel", turn, marks=pytest.mark.extended)
+            for turn in TURNS
+            if turn != "half"
+        ),
+        ("flat", "full"),
+        pytest.param("curved", "short", marks=pytest.mark.extended),
+    ],
 )
 def test_the_axis_lies_within_its_error(kind, turn):
     cases = (
