@@ -459,7 +459,7 @@ def test_two_measured_scans(task, folder):
     present, _ = task.scans(Store(folder / task.name))
     scans = [present.with_noise(200.0, k) for k in range(2)]
     names = ["fbp:soft", "gaussian@fbp:ram-lak"]
-    (alone,) = evaluate_scans(scans, task.grid, names[1])
+    (alone,) = evaluate_scans(scans, task.grid, names[1:])
     soft, blurred = evaluate_scans(scans, task.grid, names, n=2, seed=1)
     for row in (alone, blurred):
         assert row["dose_factor"] == pytest.approx(1.0, abs=0.1)
