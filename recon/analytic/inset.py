@@ -163,7 +163,8 @@ class InsetFbp:
     ) -> None:
         if surround is None and scan.counts.ndim != 3 and scan.geometry.has_rows:
             raise ValueError(
-                "FBP in HU needs a counting-mode scan; decompose or sum the energy bins before"
+                "FBP in HU needs a counting-mode scan; decompose the energy bins, or sum them "
+                "with weights, before: scan.weighted(bin_weights(scanner, …))"
             )
         self.geometry, self.window, self.linearisation = (
             scan.geometry,

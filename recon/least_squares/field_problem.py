@@ -94,7 +94,8 @@ class FieldProblem:
         self.plane = len(geometry.shape) == 2
         if not self.plane and scan.counts.ndim != 3:
             raise ValueError(
-                "PWLS in HU needs a counting-mode scan; decompose or sum the energy bins before"
+                "PWLS in HU needs a counting-mode scan; decompose the energy bins, or sum them "
+                "with weights, before: scan.weighted(bin_weights(scanner, …))"
             )
         if self.plane and tuple(grid.shape[:-2]) != tuple(scan.counts.shape[:-2]):
             wanted = (*scan.counts.shape[:-2], "y", "x")

@@ -66,7 +66,8 @@ class InsetProblem:
     def __init__(self, scan: Scan, grid: VolumeGrid, nodes: int = 5) -> None:
         if scan.counts.ndim != 3:
             raise ValueError(
-                "PWLS in HU needs a counting-mode scan; decompose or sum the energy bins before"
+                "PWLS in HU needs a counting-mode scan; decompose the energy bins, or sum them "
+                "with weights, before: scan.weighted(bin_weights(scanner, …))"
             )
         if scan.electronic_noise:
             raise ValueError(
