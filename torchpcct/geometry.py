@@ -203,6 +203,11 @@ class Geometry:
         pitch, offset = self.column_pitch / 2.0, self.column_offset + self.column_pitch / 4.0
         return replace(self, columns=2 * self.columns, pitch=pitch, offset=offset)  # type: ignore[type-var]
 
+    def scaled(self: G, factor: float) -> G:
+        """The same beam with columns so much wider, and their offset so much larger."""
+        pitch, offset = factor * self.column_pitch, factor * self.column_offset
+        return replace(self, pitch=pitch, offset=offset)  # type: ignore[type-var]
+
     def with_column_offset(self: G, offset: float) -> G:
         """The same beam with the detector's centre elsewhere along the columns, mm."""
         return replace(self, offset=offset)  # type: ignore[type-var]
@@ -469,6 +474,13 @@ class ConeBeam(_Divergent):
             columns=2 * self.columns,
             pitch=(self.row_pitch, self.column_pitch / 2.0),
             offset=(self.row_offset, self.column_offset + self.column_pitch / 4.0),
+        )
+
+    def scaled(self, factor: float) -> ConeBeam:
+        return replace(
+            self,
+            pitch=(self.row_pitch, factor * self.column_pitch),
+            offset=(self.row_offset, factor * self.column_offset),
         )
 
     def with_column_offset(self, offset: float) -> ConeBeam:

@@ -7,7 +7,6 @@ import functools
 import inspect
 import math
 import re
-import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, TypeVar, cast
 
@@ -27,26 +26,12 @@ __all__ = [
     "numbers",
     "per_axis",
     "reals",
-    "renamed",
     "shaped",
     "whole",
 ]
 
 UNITS = ("HU", "mm^-1", "pixel^-1")
 """Of scans and volumes; of ``pixel^-1`` all lengths are in pixels."""
-
-
-def renamed(old: str, new: str, value: Any) -> Any:
-    """``value``, which came as the argument ``old`` that is now called ``new``: with a
-    ``DeprecationWarning``."""
-    level, frame = 2, inspect.currentframe()
-    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in (
-        "torchpcct",
-        "recon",
-    ):
-        level, frame = level + 1, frame.f_back
-    warnings.warn(f"{old} is now called {new}", DeprecationWarning, stacklevel=max(2, level - 2))
-    return value
 
 
 def number(

@@ -258,6 +258,11 @@ class VectorGeometry(Geometry):
         finer = self._with(1, poses[:, 1] + poses[:, 2] / 4.0, 2, poses[:, 2] / 2.0)
         return replace(finer, columns=2 * self.columns)
 
+    def scaled(self, factor: float) -> VectorGeometry:
+        poses, more = self.poses, (factor - 1.0) * self.column_offset
+        along = poses[:, 2] / np.linalg.norm(poses[:, 2], axis=1, keepdims=True)
+        return self._with(1, poses[:, 1] + more * along, 2, factor * poses[:, 2])
+
     def with_column_offset(self, offset: float) -> VectorGeometry:
         """The detectors displaced along u, so that their offset is this one."""
         poses = self.poses

@@ -209,7 +209,7 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
     from recon.mbir.mbir import WEIGHTS_FORMAT
     from recon.mbir.weights_io import read_tensors
     from torchpcct.files import WriteError
-    from train.checkpoint import Store, start_from
+    from train.checkpoint import CheckpointStore, start_from
     from train.config import TrainConfig, load_config, packaged_config
     from train.loop import train
     from train.run import DivergedError
@@ -221,7 +221,7 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
         if arguments.config is not None:
             config = load_config(arguments.config)
         elif arguments.resume and not arguments.quick:
-            config = TrainConfig.from_yaml(Store(arguments.out).load()[1]["config"])
+            config = TrainConfig.from_yaml(CheckpointStore(arguments.out).load()[1]["config"])
             if "class" in config.network:
                 raise ValueError(
                     f"the run in {arguments.out} trains {config.network['class']}, which no file "

@@ -30,7 +30,7 @@ from recon.mbir.mbir import WEIGHTS_FORMAT
 from recon.mbir.weights_io import TensorFileError, digest, write_tensors
 from recon.study.study import environment
 from torchpcct.files import atomic_write
-from train.checkpoint import Store
+from train.checkpoint import CheckpointStore
 from train.config import TrainConfig, differences
 from train.data import Data, seed_of
 from train.logs import Logs
@@ -122,7 +122,7 @@ class Run:
         self.group = group
         self.out = out
         self.writes = group.rank == 0
-        self.store = Store(out)
+        self.store = CheckpointStore(out)
         self.state = State()
         self.average = _averaged(model, config.ema)
         self.best: dict[str, Tensor] = {}

@@ -460,7 +460,7 @@ def executing(arguments: argparse.Namespace, out: Path) -> Iterator[Any]:
 
     executor: Any = None
     if arguments.dry_run:
-        executor = execute.Plan()
+        executor = execute.Planner()
     elif arguments.workers is not None:
         executor = execute.Processes(arguments.workers, arguments.threads, _WORKERS_LOAD)
     elif arguments.scheduler:

@@ -22,12 +22,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.evaluate.vessels import Centreline
+from recon.evaluate.vessels import VesselAxis
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scene.plaque import Plaque
 from torchpcct.validate import choice
 
-__all__ = ["ANATOMIES", "TISSUES_HU", "Anatomy", "Part", "anatomy"]
+__all__ = ["ANATOMIES", "TISSUES_HU", "Anatomy", "AnatomyPart", "anatomy"]
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -50,11 +50,11 @@ TISSUES_HU: Mapping[str, float] = {
 }
 """CT numbers of the tissues; all but fat, which fills the rest, are those of parts."""
 
-_STRAIGHT = Centreline((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+_STRAIGHT = VesselAxis((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True)
-class Part:
+class AnatomyPart:
     """A region of one tissue.
 
     Args:
@@ -82,9 +82,9 @@ class Anatomy:
     """
 
     title: str
-    base: tuple[Part, ...]
-    feature: tuple[Part, ...]
-    line: Centreline = _STRAIGHT
+    base: tuple[AnatomyPart, ...]
+    feature: tuple[AnatomyPart, ...]
+    line: VesselAxis = _STRAIGHT
     hu: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
@@ -97,7 +97,7 @@ class Anatomy:
         3)`` x, y, z in mm about the inset's middle."""
         names, local = list(self.values), np.moveaxis(self.line.local(points), -1, 0)
 
-        def laid(over: NDArray[np.int64], parts: tuple[Part, ...]) -> NDArray[np.int64]:
+        def laid(over: NDArray[np.int64], parts: tuple[AnatomyPart, ...]) -> NDArray[np.int64]:
             found = over.copy()
             for part in parts:
                 inside = part.inside(*local)
@@ -208,42 +208,42 @@ def _rod(start: Sequence[float], along: Sequence[float], radius: float, length: 
 
 def _vessel(
     radius: float = _R, lumen: float | Callable[[Floats], Floats] = _LUMEN, half: float = _HALF
-) -> list[Part]:
+) -> list[AnatomyPart]:
     """A healthy vessel: wall, thin intima, lumen."""
     return [
-        Part("wall", _tube(radius, half)),
-        Part("fibrous", _tube(radius - _WALL, half)),
-        Part("lumen", _tube(lumen, half)),
+        AnatomyPart("wall", _tube(radius, half)),
+        AnatomyPart("fibrous", _tube(radius - _WALL, half)),
+        AnatomyPart("lumen", _tube(lumen, half)),
     ]
 
 
-def _plaque(plaque: Plaque = _PLAQUE) -> list[Part]:
+def _plaque(plaque: Plaque = _PLAQUE) -> list[AnatomyPart]:
     return [
-        Part("wall", _within_shape(plaque.outer)),
-        Part("fibrous", _within_shape(plaque.inner)),
-        Part("lumen", _within_shape(plaque.lumen)),
+        AnatomyPart("wall", _within_shape(plaque.outer)),
+        AnatomyPart("fibrous", _within_shape(plaque.inner)),
+        AnatomyPart("lumen", _within_shape(plaque.lumen)),
     ]
 
 
-def _core(tissue: str = "core", plaque: Plaque = _PLAQUE) -> list[Part]:
-    return [Part(tissue, _within_shape(plaque.core), ("fibrous",))]
+def _core(tissue: str = "core", plaque: Plaque = _PLAQUE) -> list[AnatomyPart]:
+    return [AnatomyPart(tissue, _within_shape(plaque.core), ("fibrous",))]
 
 
 def _second(
     distance: float, tilt: float, tissue: str = "lumen", radius: float = 0.95
-) -> list[Part]:
+) -> list[AnatomyPart]:
     """Another vessel beside, its axis ``distance`` mm off on the side of the plaque."""
     u = (0.0, math.sin(tilt), math.cos(tilt))
     start, length = (distance, -4.0 * u[1], -4.0 * u[2]), 8.0
     return [
-        Part("wall", _rod(start, u, radius, length), ("fat",)),
-        Part(tissue, _rod(start, u, radius - 0.18, length), ("fat", "wall")),
+        AnatomyPart("wall", _rod(start, u, radius, length), ("fat",)),
+        AnatomyPart(tissue, _rod(start, u, radius - 0.18, length), ("fat", "wall")),
     ]
 
 
-def _muscle(face: float) -> list[Part]:
+def _muscle(face: float) -> list[AnatomyPart]:
     """Muscle beyond a plane so far from the axis, on the side away from the plaque."""
-    return [Part("muscle", lambda a, b, s: a < -face, ("fat",))]
+    return [AnatomyPart("muscle", lambda a, b, s: a < -face, ("fat",))]
 
 
 def _narrowing(depth: float, length: float) -> Callable[[Floats], Floats]:
@@ -270,7 +270,7 @@ _THIN = replace(_PLAQUE, cap_thickness=0.12)
 _PAPER = Plaque(position=(0.0, 0.0, 0.0))
 _PAPER_HU = {"wall": 63.5, "fibrous": 103.2, "lumen": 480.0, "core": 41.1}
 """The plaque of the paper, and what its tissues read on its scanner."""
-_BENT = Centreline((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), 3.5)
+_BENT = VesselAxis((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), 3.5)
 
 _HEALTHY = tuple(_vessel())
 _WITH_PLAQUE = tuple(_plaque())
@@ -285,18 +285,18 @@ ANATOMIES: dict[str, Anatomy] = {
     "ulcer": Anatomy(
         "a crater of 1 mm in the plaque, open to the lumen",
         _WITH_PLAQUE,
-        (Part("lumen", _ball((0.55, 0.0, 0.3), (0.85, 0.5, 0.5)), ("fibrous",)),),
+        (AnatomyPart("lumen", _ball((0.55, 0.0, 0.3), (0.85, 0.5, 0.5)), ("fibrous",)),),
     ),
     "thrombus": Anatomy(
         "a thrombus of 1.1 mm on the lumen's wall",
         _HEALTHY,
-        (Part("thrombus", _ball((-0.4, 1.05, -0.2), 0.55), ("lumen",)),),
+        (AnatomyPart("thrombus", _ball((-0.4, 1.05, -0.2), 0.55), ("lumen",)),),
     ),
     "flap": Anatomy(
         "a dissection: a flap of 0.28 mm across the lumen",
         _HEALTHY,
         (
-            Part(
+            AnatomyPart(
                 "flap",
                 lambda a, b, s: (
                     (np.abs(0.8 * a + 0.6 * b - 0.25 - 0.08 * s) < 0.14) & (np.abs(s) < 2.6)
@@ -308,28 +308,28 @@ ANATOMIES: dict[str, Anatomy] = {
     "calcification": Anatomy(
         "a spotty calcification of 0.5 mm in the wall",
         _HEALTHY,
-        (Part("calcium", _ball((-1.1, -1.1, 0.4), 0.25), ("wall", "fibrous")),),
+        (AnatomyPart("calcium", _ball((-1.1, -1.1, 0.4), 0.25), ("wall", "fibrous")),),
     ),
     "stent": Anatomy(
-        "a stent of wires of 0.11 mm", _HEALTHY, (Part("metal", _struts, ("lumen",)),)
+        "a stent of wires of 0.11 mm", _HEALTHY, (AnatomyPart("metal", _struts, ("lumen",)),)
     ),
     "inflamed_30": Anatomy(
         "fat inflamed by 30 HU in a ring of 1 mm",
         _HEALTHY,
-        (Part("inflamed", _tube(_R + 1.0), ("fat",)),),
+        (AnatomyPart("inflamed", _tube(_R + 1.0), ("fat",)),),
     ),
     "inflamed_15": Anatomy(
         "fat inflamed by 15 HU in a ring of 1 mm",
         _HEALTHY,
-        (Part("inflamed", _tube(_R + 1.0), ("fat",)),),
+        (AnatomyPart("inflamed", _tube(_R + 1.0), ("fat",)),),
         hu={"inflamed": -75.0},
     ),
     "branch": Anatomy(
         "a side branch of 1.6 mm",
         _HEALTHY,
         (
-            Part("wall", _rod((0.0, 0.0, -0.5), _BRANCH, 0.8, 4.9), ("fat",)),
-            Part("lumen", _rod((0.0, 0.0, -0.5), _BRANCH, 0.6, 4.9)),
+            AnatomyPart("wall", _rod((0.0, 0.0, -0.5), _BRANCH, 0.8, 4.9), ("fat",)),
+            AnatomyPart("lumen", _rod((0.0, 0.0, -0.5), _BRANCH, 0.6, 4.9)),
         ),
     ),
     "touching": Anatomy(
@@ -366,7 +366,7 @@ ANATOMIES: dict[str, Anatomy] = {
         "a round stenosis of 72 %",
         _HEALTHY,
         (
-            Part(
+            AnatomyPart(
                 "fibrous",
                 lambda a, b, s: np.hypot(a, b) > _narrowing(0.72, 0.8)(s),
                 ("lumen",),
@@ -377,15 +377,15 @@ ANATOMIES: dict[str, Anatomy] = {
         "an aneurysm of 5.8 mm",
         _HEALTHY,
         (
-            Part("wall", _tube(lambda s: _R + _bulging(s)), ("fat",)),
-            Part("fibrous", _tube(lambda s: _R - _WALL + _bulging(s)), ("fat", "wall")),
-            Part("lumen", _tube(lambda s: _LUMEN + _bulging(s))),
+            AnatomyPart("wall", _tube(lambda s: _R + _bulging(s)), ("fat",)),
+            AnatomyPart("fibrous", _tube(lambda s: _R - _WALL + _bulging(s)), ("fat", "wall")),
+            AnatomyPart("lumen", _tube(lambda s: _LUMEN + _bulging(s))),
         ),
     ),
     "occlusion": Anatomy(
         "an occlusion by thrombus, from the middle on",
         _HEALTHY,
-        (Part("thrombus", lambda a, b, s: s > 0.35 + 0.15 * a, ("lumen",)),),
+        (AnatomyPart("thrombus", lambda a, b, s: s > 0.35 + 0.15 * a, ("lumen",)),),
     ),
     "low_enhancement": Anatomy(
         "a necrotic core, the lumen enhanced to 160 HU",

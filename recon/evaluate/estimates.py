@@ -43,7 +43,7 @@ from torchpcct.metrics.control import controlled_log_variance, controlled_mean
 from torchpcct.metrics.intervals import Estimate, Jackknifed, combined, log_of_sum
 from torchpcct.metrics.observer import d_prime, hotelling_scores
 
-__all__ = ["Known", "Record", "pivot", "records_of"]
+__all__ = ["Record", "ReferenceNoise", "pivot", "records_of"]
 
 Floats = NDArray[np.float64]
 Record = dict[str, Any]
@@ -62,7 +62,7 @@ Figure = Jackknifed | float
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class ReferenceNoise:
     """What holds without sampling error of the linear reference.
 
     Attributes:
@@ -84,8 +84,8 @@ class _Figures:
         true: ``(rois,)`` contrasts that the signal adds, HU: background less signal.
         absent: ``(rois,)`` true contrasts without the signal, HU.
         reference: on the same draws; what is drawn is controlled by it.
-        exact: the method's own covariance of ROI means as :attr:`Known.covariance`; None: it is
-            drawn.
+        exact: the method's own covariance of ROI means as
+            :attr:`ReferenceNoise.covariance`; None: it is drawn.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class _Figures:
         readings: Readings,
         true: Floats,
         absent: Floats,
-        reference: Known,
+        reference: ReferenceNoise,
         exact: Floats | None,
     ) -> None:
         self.r, self.true, self.absent, self.reference, self.exact = (
@@ -239,7 +239,7 @@ def records_of(
     exposure_s: float,
     readings: Readings,
     base: Readings,
-    reference: Known,
+    reference: ReferenceNoise,
     facts: Facts,
     true: Floats,
     absent: Floats,
@@ -264,7 +264,7 @@ def records_of(
     control = reference
     if readings.control is not None:
         drawn, mean, covariance = readings.control
-        control = Known(covariance, mean, drawn)
+        control = ReferenceNoise(covariance, mean, drawn)
     own, other = (
         _Figures(readings, true, absent, control, exact),
         _Figures(

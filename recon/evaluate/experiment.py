@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from recon.evaluate.draws import Draws
 from recon.evaluate.energies import BINS, EnergyDraws, with_bins
-from recon.evaluate.estimates import Known, Record, records_of
+from recon.evaluate.estimates import Record, ReferenceNoise, records_of
 from recon.evaluate.measure import BLOCK, Measurement, Reader, Readings, kept_as
 from recon.evaluate.methods import Method, method_of
 from recon.evaluate.task import Facts, Task
@@ -462,7 +462,7 @@ def _read(bench: _Bench, exposures: Sequence[float], n: int) -> tuple[list[Recor
         found = {m.name: bench.readings(m.name, exposure, n) for m in everyone}
         base = found[reference.name]
         known = at_1_s[reference.energies][reference.kernels[0]] / exposure
-        control = Known(known, base.clean_rois, base.rois)
+        control = ReferenceNoise(known, base.clean_rois, base.rois)
         for method in everyone:
             own = found[method.name]
             e = method.energies

@@ -21,7 +21,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from recon.evaluate.draws import Draws
-from recon.evaluate.methods import Draw, Method
+from recon.evaluate.methods import Method, Realisation
 from recon.evaluate.task import BESIDE_MM, Task
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.observer import dog_channels, template_channel
@@ -201,7 +201,7 @@ class Reader:
         return {t: volume.reshape(-1)[at].float().numpy() for t, at in self.task.flat.items()}
 
 
-def volume_of(method: Method, draw: Draw) -> Tensor:
+def volume_of(method: Method, draw: Realisation) -> Tensor:
     """A method's volume, checked: HU ``(z, y, x)`` float32.
 
     Raises:
@@ -297,7 +297,7 @@ class Measurement:
             self._known = self.store.piece(f"{self._place}/response", self._key, respond)
             self._adjoints = torch.from_numpy(self._known["adjoints"])
 
-    def block(self, k: range, pairs: Callable[[], Sequence[Sequence[Draw]]]) -> None:
+    def block(self, k: range, pairs: Callable[[], Sequence[Sequence[Realisation]]]) -> None:
         """Realisations ``k``; ``pairs`` gives them, if they have not been measured before."""
 
         def compute() -> dict[str, Any]:

@@ -23,7 +23,7 @@ A method's name says all:
   scans' names, as ``torchpcct reconstruct`` gives them, too.
 
 Whatever it is, it becomes a :class:`Method`, a function of one realisation of a scan
-(:class:`Draw`).
+(:class:`Realisation`).
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ from torchpcct.scan import Scan
 from torchpcct.volume import Volume
 
 __all__ = [
-    "Draw",
     "Method",
+    "Realisation",
     "deepinv_denoiser",
     "denoiser",
     "method_of",
@@ -63,7 +63,7 @@ __all__ = [
 ]
 
 
-class Draw(Protocol):
+class Realisation(Protocol):
     """One realisation, as a method sees it: simulated (:mod:`recon.evaluate.draws`) or measured."""
 
     @property
@@ -109,7 +109,7 @@ class Method:
 
     Args:
         name: for tables.
-        run: from a :class:`Draw` to HU ``(z, y, x)``.
+        run: from a :class:`Realisation` to HU ``(z, y, x)``.
         key: what its results depend on beside its name (weights, source), so that kept ones are not
             mixed up.
         kernels: of FBP that it asks a draw for.
@@ -123,7 +123,7 @@ class Method:
     """
 
     name: str
-    run: Callable[[Draw], Tensor]
+    run: Callable[[Realisation], Tensor]
     key: str = ""
     kernels: tuple[str, ...] = ()
     is_fbp: bool = False
@@ -215,7 +215,7 @@ def denoiser(function: Callable[..., Any], base: Any, name: str = "") -> Method:
     plain = getattr(function, "__name__", "denoiser")
     denoise = denoiser_of(function)
 
-    def run(draw: Draw) -> Any:
+    def run(draw: Realisation) -> Any:
         return denoise(before.run(draw), lambda: draw.sigma(before))
 
     name = name or f"{plain}@{before.name}"
@@ -227,7 +227,7 @@ def _filtered(name: str, base: str, spec: str) -> Method:
     """A filter of :mod:`recon.evaluate.rivals` with the settings that were tuned for it."""
     before, name = method_of(base), filter_name(name)
 
-    def run(draw: Draw) -> Tensor:
+    def run(draw: Realisation) -> Tensor:
         settings = tuned(name, before.kernels[0], draw.exposure_s)
         smooths = settings.get("sigma", SMOOTHED_BY.get(name, 0.0)) if name in SMOOTHED_BY else 0.0
         found: Tensor = FILTERS[name](before.run(draw), draw.sigma(before, smooths), **settings)
@@ -266,7 +266,7 @@ def _of_function(name: str, function: Callable[..., Any]) -> Method:
 
 
 def _of_files(spec: str, folder: Path) -> Method:
-    def run(draw: Draw) -> Tensor:
+    def run(draw: Realisation) -> Tensor:
         task, name = draw.label.split("/")
         wanted = (name, *(f"{name}_{method}" for method in ("fbp", "pwls", "mbir")))
         there = volume_files(folder / task) or volume_files(folder)

@@ -19,7 +19,7 @@ from torch import Tensor
 from recon.evaluate.anatomies import ANATOMIES, Anatomy
 from recon.evaluate.names import TASKS
 from recon.evaluate.task import BESIDE_MM, Facts, SomeViews, Task, contrast_limit
-from recon.evaluate.vessels import SHAPES, Vessel
+from recon.evaluate.vessels import SHAPES, PaintedVessel
 from recon.jobs.store import Store
 from recon.mbir.mbir import overlap
 from torchpcct import Projector, VolumeGrid
@@ -235,9 +235,9 @@ class VesselTask(Task):
     has_energies: ClassVar[bool] = False
 
     @cached_property
-    def _vessel(self) -> Vessel:
+    def _vessel(self) -> PaintedVessel:
         line, branch = SHAPES[self.direction]
-        return Vessel(line, self.grid.center, branch)
+        return PaintedVessel(line, self.grid.center, branch)
 
     def scan(self, store: Store, signal: str) -> Scan:
         """See :meth:`Task.scan`."""

@@ -22,7 +22,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.scene import Scene
 from torchpcct.scene.plaque import Plaque, plaque_scene
 
-__all__ = ["LENGTH_MM", "SHAPES", "Branch", "Centreline", "Vessel"]
+__all__ = ["LENGTH_MM", "SHAPES", "Branch", "PaintedVessel", "VesselAxis"]
 
 Floats = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ _PLAQUE = Plaque(position=(0.0, 0.0, 0.0), vessel_length=LENGTH_MM)
 
 
 @dataclass(frozen=True)
-class Centreline:
+class VesselAxis:
     """A straight line or a circle's arc through the origin.
 
     Args:
@@ -106,7 +106,7 @@ class Branch:
 
 
 @dataclass(frozen=True)
-class Vessel:
+class PaintedVessel:
     """The plaque on a centreline.
 
     Args:
@@ -116,7 +116,7 @@ class Vessel:
         plaque: its geometry, in the vessel's own coordinates.
     """
 
-    line: Centreline
+    line: VesselAxis
     center: tuple[float, float, float]
     branch: Branch | None = None
     plaque: Plaque = _PLAQUE
@@ -170,14 +170,14 @@ _Y = (0.0, 1.0, 0.0)
 _Z = (0.0, 0.0, 1.0)
 _HALF = math.sqrt(0.5)
 
-SHAPES: dict[str, tuple[Centreline, Branch | None]] = {
-    "straight": (Centreline(_Z, _X), None),
-    "tilted": (Centreline((0.0, _HALF, _HALF), _X), None),
-    "in_plane_x": (Centreline(_X, (0.0, -1.0, 0.0)), None),
-    "in_plane_y": (Centreline(_Y, _X), None),
-    "curved_8mm": (Centreline(_Z, _X, 8.0), None),
-    "curved_5mm": (Centreline(_Z, _X, 5.0), None),
-    "bifurcating": (Centreline(_Z, _X), Branch()),
+SHAPES: dict[str, tuple[VesselAxis, Branch | None]] = {
+    "straight": (VesselAxis(_Z, _X), None),
+    "tilted": (VesselAxis((0.0, _HALF, _HALF), _X), None),
+    "in_plane_x": (VesselAxis(_X, (0.0, -1.0, 0.0)), None),
+    "in_plane_y": (VesselAxis(_Y, _X), None),
+    "curved_8mm": (VesselAxis(_Z, _X, 8.0), None),
+    "curved_5mm": (VesselAxis(_Z, _X, 5.0), None),
+    "bifurcating": (VesselAxis(_Z, _X), Branch()),
 }
 """Centreline and side branch of every vessel; ``in_plane_x`` is ``in_plane_y`` turned by a right
 angle about z."""

@@ -59,8 +59,8 @@ __all__ = [
     "Cluster",
     "Job",
     "LeftOut",
-    "Plan",
     "Planned",
+    "Planner",
     "Processes",
     "Unfit",
     "Unportable",
@@ -648,7 +648,7 @@ def run(
         ConnectionError: the scheduler is gone.
         Exception: whatever a job's function raises; those that are done are kept.
     """
-    if isinstance(executor, Plan):
+    if isinstance(executor, Planner):
         raise Planned(_table(jobs))
     if not jobs:
         return {}
@@ -858,7 +858,7 @@ class _Log:
         return f"jobs|{done} done, {running} running, {failed} failed{until}{compiled}"
 
 
-class Plan(Executor):
+class Planner(Executor):
     """No executor: :func:`run` lists the jobs and raises :class:`Planned` with the list."""
 
     workers = 1

@@ -40,7 +40,7 @@ from recon.least_squares.model_solver import ModelSolver, line_search
 from recon.least_squares.qggmrf import QGGMRF, BoundPrior
 from recon.result import Result
 from torchpcct.detector_window import footprint
-from torchpcct.validate import checked, number, renamed, whole
+from torchpcct.validate import checked, number, whole
 
 __all__ = [
     "Approach",
@@ -174,7 +174,6 @@ def pwls(
     max_exact: int = 200,
     memory: int | None = None,
     callback: Callable[[dict[str, Any]], None] | None = None,
-    hu: float | None = None,
 ) -> Result:
     """Minimise ½‖y − A x‖²_W + R(x), in 2-D and 3-D, for an inset or a whole field of view.
 
@@ -208,7 +207,6 @@ def pwls(
         callback: called before each outer iteration with a dict of ``outer``, ``exact_pairs``,
             ``gradient``, ``rmsd_hu`` and ``x``, the volumes so far ``(batch, *grid.shape)``, not to
             be changed.
-        hu: the former name of ``mu_per_hu``.
 
     Returns:
         The volume in the dtype of y, and the report.
@@ -229,8 +227,6 @@ def pwls(
         >>> found.report["converged"], round(float(found.volume.mean()), 3)
         (True, 0.02)
     """
-    if hu is not None:
-        mu_per_hu = renamed("hu", "mu_per_hu", hu)
     started = time.perf_counter()
     rays = tuple(A.range_shape)
     channels = weights.dim() > len(rays)

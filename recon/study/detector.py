@@ -115,7 +115,7 @@ def _pile_up(settings: Settings, pieces: Pieces, dead_time_ns: float) -> Any:
 # --- efficiency -----------------------------------------------------------------------------------
 
 
-class Case(NamedTuple):
+class DetectorInBeam(NamedTuple):
     """A detector in a beam: photons per energy in keV."""
 
     name: str
@@ -125,7 +125,7 @@ class Case(NamedTuple):
     photons: NDArray[np.float64]
 
 
-def cases() -> list[Case]:
+def cases() -> list[DetectorInBeam]:
     """The detectors and beams that are compared, from this package's defaults to the published
     figure's."""
     standard, hard = (
@@ -134,16 +134,16 @@ def cases() -> list[Case]:
     )
     deep, short = SiliconDetector(), SiliconDetector(length_mm=30.0)
     return [
-        Case("60 mm, 100 kVp, 24 cm fat", deep, Stack(), *standard),
-        Case("60 mm, foils of 10 µm", deep, Stack(foil_mm=0.01), *standard),
-        Case("60 mm, no foils", deep, Stack(foil_mm=0.0), *standard),
-        Case("30 mm, 100 kVp, 24 cm fat", short, Stack(), *standard),
-        Case("60 mm, 120 kVp, 30 cm water", deep, Stack(), *hard),
-        Case("30 mm, 120 kVp, 30 cm water", short, Stack(), *hard),
+        DetectorInBeam("60 mm, 100 kVp, 24 cm fat", deep, Stack(), *standard),
+        DetectorInBeam("60 mm, foils of 10 µm", deep, Stack(foil_mm=0.01), *standard),
+        DetectorInBeam("60 mm, no foils", deep, Stack(foil_mm=0.0), *standard),
+        DetectorInBeam("30 mm, 100 kVp, 24 cm fat", short, Stack(), *standard),
+        DetectorInBeam("60 mm, 120 kVp, 30 cm water", deep, Stack(), *hard),
+        DetectorInBeam("30 mm, 120 kVp, 30 cm water", short, Stack(), *hard),
     ]
 
 
-def efficiencies(case: Case, photons: int, rng: np.random.Generator) -> dict[str, Any]:
+def efficiencies(case: DetectorInBeam, photons: int, rng: np.random.Generator) -> dict[str, Any]:
     """One-interaction share, and DQE of counts by following photons, against the lowest
     threshold."""
     d = replace(case.detector, fill_factor=1.0 - case.stack.foil_mm / case.stack.sheet_pitch_mm)

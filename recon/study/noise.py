@@ -139,9 +139,9 @@ class Moments:
     variances: dict[float, Any]
     images: dict[tuple[str, float], Any] = field(default_factory=dict)
 
-    def exact(self, exposure_s: float) -> Table:
+    def exact(self, exposure_s: float) -> RoiStatistics:
         """The truth at an exposure."""
-        return Table(
+        return RoiStatistics(
             self.expected,
             np.sqrt(np.diag(self.covariance) / exposure_s).reshape(self.expected.shape),
         )
@@ -380,7 +380,7 @@ def _pairs(s: Settings, m: Moments, exposure: float) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Table:
+class RoiStatistics:
     """Statistics of ROI means for every setting, any number of leading axes.
 
     Attributes:
@@ -398,13 +398,13 @@ class Table:
         )
 
 
-def measured_table(means: Any) -> Table:
+def measured_table(means: Any) -> RoiStatistics:
     """From realisations: ``(..., n, settings, 2)`` ROI means."""
     values = np.asarray(means, dtype=np.float64)
-    return Table(values.mean(-3), values.std(-3, ddof=1))
+    return RoiStatistics(values.mean(-3), values.std(-3, ddof=1))
 
 
-def few_run_tables(mean: Any, covariance: Any, draws: int, seed: int) -> Table:
+def few_run_tables(mean: Any, covariance: Any, draws: int, seed: int) -> RoiStatistics:
     """Tables that so many experiments of ten realisations would report, whose ROI means
     ``(settings, 2)`` HU have this covariance ``(2 · settings, 2 · settings)`` HU²."""
     rng, parts = np.random.default_rng(seed), []
@@ -414,10 +414,12 @@ def few_run_tables(mean: Any, covariance: Any, draws: int, seed: int) -> Table:
             np.ravel(mean), covariance, shape, check_valid="ignore", method="eigh"
         )
         parts.append(measured_table(runs.reshape(*shape, *np.shape(mean))))
-    return Table(np.concatenate([p.mean for p in parts]), np.concatenate([p.sd for p in parts]))
+    return RoiStatistics(
+        np.concatenate([p.mean for p in parts]), np.concatenate([p.sd for p in parts])
+    )
 
 
-def resampled_tables(values: Floats, indices: NDArray[np.int64]) -> Table:
+def resampled_tables(values: Floats, indices: NDArray[np.int64]) -> RoiStatistics:
     """Tables of resamples of ``(n, settings, 2)`` ROI means, by counts: moments are linear in how
     often each realisation was drawn."""
     n = len(values)
@@ -429,7 +431,7 @@ def resampled_tables(values: Floats, indices: NDArray[np.int64]) -> Table:
     first, second = counts @ flat / size, counts @ flat**2 / size
     variance = np.clip(second - first**2, 0.0, None) * size / (size - 1)
     shape = (-1, *values.shape[1:])
-    return Table(first.reshape(shape) + centre, np.sqrt(variance).reshape(shape))
+    return RoiStatistics(first.reshape(shape) + centre, np.sqrt(variance).reshape(shape))
 
 
 @dataclass(frozen=True)
@@ -463,7 +465,7 @@ class Pair:
 
 def pair_differences(
     means: Any,
-    exact: Table,
+    exact: RoiStatistics,
     pairs: Sequence[tuple[int, int]],
     *,
     level: float = 0.95,

@@ -19,8 +19,8 @@ and fit), :mod:`~recon.vessel.core` and :mod:`~recon.vessel.particles` (plaque b
 reconstruct the rest around.
 """
 
-from recon.vessel.figures import Estimate
+from recon.vessel.figures import TissueEstimate
 from recon.vessel.prior import VesselPrior
 from recon.vessel.reading import PlaqueReading, read_plaque
 
-__all__ = ["Estimate", "PlaqueReading", "VesselPrior", "read_plaque"]
+__all__ = ["PlaqueReading", "TissueEstimate", "VesselPrior", "read_plaque"]

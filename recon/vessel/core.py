@@ -19,7 +19,7 @@ from scipy.linalg import solve_triangular
 
 from recon.vessel.kernels import core_fractions, sharpened
 from recon.vessel.local_gram import LocalGram
-from recon.vessel.model import EXCESS, Fit, Vessel
+from recon.vessel.model import EXCESS, Fit, VesselModel
 from torchpcct.threads import run
 from torchpcct.validate import shaped
 
@@ -92,7 +92,7 @@ class CoreSpace:
 
     def __init__(
         self,
-        vessel: Vessel,
+        vessel: VesselModel,
         fit: Fit,
         prior: CorePrior,
         replaces: int | None = None,

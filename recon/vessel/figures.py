@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.vessel.core import AXES, CAP, CENTRE, CoreSpace
-from recon.vessel.model import FAT, FIBROUS, LUMEN, THICKNESS, WALL, Fit, Vessel
-from recon.vessel.quality import Texture
+from recon.vessel.model import FAT, FIBROUS, LUMEN, THICKNESS, WALL, Fit, VesselModel
+from recon.vessel.quality import ResidualTexture
 
-__all__ = ["Estimate", "draws_of", "estimate"]
+__all__ = ["TissueEstimate", "draws_of", "estimate"]
 
 Floats = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ _SURFACE = 96
 
 
 @dataclass(frozen=True)
-class Estimate:
+class TissueEstimate:
     """A figure.
 
     Attributes:
@@ -39,19 +39,19 @@ class Estimate:
     unit: str
 
 
-def estimate(draws: Floats, unit: str) -> Estimate:
+def estimate(draws: Floats, unit: str) -> TissueEstimate:
     """Mean, 95 % interval and standard deviation of draws."""
     low, high = np.quantile(draws, (0.025, 0.975))
-    return Estimate(float(draws.mean()), float(low), float(high), float(draws.std()), unit)
+    return TissueEstimate(float(draws.mean()), float(low), float(high), float(draws.std()), unit)
 
 
 def draws_of(
-    vessel: Vessel,
+    vessel: VesselModel,
     fit: Fit,
     space: CoreSpace,
     shapes: Floats,
     shares: NDArray[np.float32],
-    texture: Texture,
+    texture: ResidualTexture,
     rng: np.random.Generator,
 ) -> dict[str, Floats]:
     """Draws ``(shapes · 20,)`` of each figure, those of the core given that it is there.
@@ -111,7 +111,7 @@ def draws_of(
     return {name: v.ravel() for name, v in values.items()}
 
 
-def _area(vessel: Vessel, fit: Fit, s: Floats, count: int) -> tuple[Floats, Floats]:
+def _area(vessel: VesselModel, fit: Fit, s: Floats, count: int) -> tuple[Floats, Floats]:
     """Areas mm² of the lumen at positions ``(k,)``, and their gradients ``(k, count)``."""
     angles = np.arange(48) * (2 * math.pi / 48)
     at = vessel.lumen_outline.at_angles(np.repeat(s, 48), np.tile(angles, len(s)))
@@ -124,7 +124,7 @@ def _area(vessel: Vessel, fit: Fit, s: Floats, count: int) -> tuple[Floats, Floa
 
 
 def _caps(
-    vessel: Vessel, fit: Fit, space: CoreSpace, shapes: Floats, count: int
+    vessel: VesselModel, fit: Fit, space: CoreSpace, shapes: Floats, count: int
 ) -> tuple[Floats, Floats]:
     """Smallest distance of each core from the lumen, mm ``(m,)``, and its gradient ``(m,
     count)``."""

@@ -49,7 +49,7 @@ from recon.mbir.known import Drawn, Known
 from recon.mbir.unrolled import DEFAULT_FIDELITY
 from recon.vessel.data import grid_of, in_hu, pilot
 from recon.vessel.layer import SD_HU, LayerEstimate
-from recon.vessel.model import FAT, FIBROUS, WALL, Fit, Vessel
+from recon.vessel.model import FAT, FIBROUS, WALL, Fit, VesselModel
 from recon.vessel.prior import VesselPrior
 from recon.vessel.quality import STRIKING, scores_of
 from recon.vessel.reading import read_plaque
@@ -140,7 +140,7 @@ class KnownVessel:
             # Many small matrices: BLAS threads would wait for each other.
             with threadpool_limits(limits=1, user_api="blas"):
                 prior = self.vessel_prior or VesselPrior(shift=_SHIFT_HU)
-                vessel = Vessel(data, find_vessel(pilot(data), grid_of(data), None), prior)
+                vessel = VesselModel(data, find_vessel(pilot(data), grid_of(data), None), prior)
                 estimate = LayerEstimate(
                     vessel.fit(vessel.first_guess(), expected=True), layer_sd_hu(fidelity)
                 )
@@ -162,7 +162,7 @@ class KnownVessel:
                 return ""
             return f"its outlines leave {highest:.0f} standard deviations of the noise unexplained"
 
-        return Drawn(_Linear.apply(b, estimate, term.mu_per_hu), objection=objection)
+        return Drawn(_LinearImage.apply(b, estimate, term.mu_per_hu), objection=objection)
 
 
 @dataclass(frozen=True)
@@ -220,7 +220,7 @@ def _without(found: Drawn, why: str) -> Drawn:
     )
 
 
-class _Linear(torch.autograd.Function):
+class _LinearImage(torch.autograd.Function):
     """The image of an estimate, whose change with b is linear and symmetric."""
 
     @staticmethod
@@ -236,7 +236,7 @@ class _Linear(torch.autograd.Function):
         return torch.from_numpy(change).to(grad) * mu_per_hu, None, None
 
 
-def _apart(vessel: Vessel, fit: Fit) -> NDArray[np.float32]:
+def _apart(vessel: VesselModel, fit: Fit) -> NDArray[np.float32]:
     """1 for voxels that are so far from the vessel's wall that nothing there can be meant for
     it, 0 elsewhere."""
     outside = vessel.on_grid(fit.drawing.shares[0]) < 0.5

@@ -26,7 +26,7 @@ from scipy.linalg import cho_solve, eigh
 from torch import Tensor
 
 from recon.conjugate_gradient import conjugate_gradient
-from recon.vessel.model import FAT, Fit, Vessel
+from recon.vessel.model import FAT, Fit, VesselModel
 
 __all__ = ["LENGTHS_MM", "SD_HU", "LayerEstimate", "LayerField"]
 
@@ -66,7 +66,10 @@ class LayerField:
     """
 
     def __init__(
-        self, vessel: Vessel, share: Floats, lengths_mm: tuple[float, float, float] = LENGTHS_MM
+        self,
+        vessel: VesselModel,
+        share: Floats,
+        lengths_mm: tuple[float, float, float] = LENGTHS_MM,
     ) -> None:
         # Where there is no layer at all the field is anything: no voxel takes of it.
         share = np.maximum(share, _LEAST_SHARE if share.max() <= _LEAST_SHARE else 0.0)

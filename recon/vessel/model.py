@@ -34,7 +34,7 @@ from recon.vessel.local_gram import LocalGram
 from recon.vessel.outline import Outline, OutlineAt
 from recon.vessel.prior import VesselPrior
 
-__all__ = ["FAT", "FIBROUS", "LUMEN", "THICKNESS", "WALL", "Drawing", "Fit", "Start", "Vessel"]
+__all__ = ["FAT", "FIBROUS", "LUMEN", "THICKNESS", "WALL", "Drawing", "Fit", "Start", "VesselModel"]
 
 Floats = NDArray[np.float64]
 
@@ -158,7 +158,7 @@ class Fit:
     gradient: Floats
     precision: Floats
     bodies: Floats
-    vessel: Vessel
+    vessel: VesselModel
 
     @cached_property
     def hessian(self) -> Floats:
@@ -217,7 +217,7 @@ def _behind(distance: Floats, variance: Floats) -> tuple[Floats, Floats]:
     )
 
 
-class Vessel:
+class VesselModel:
     """The model of one vessel and its data.
 
     Args:

@@ -18,9 +18,9 @@ from torch import Tensor
 from recon.data_term import Quadratic
 from recon.vessel.data import least_squares, pilot
 from recon.vessel.data import scores as scores_in
-from recon.vessel.model import FAT, FIBROUS, Fit, Vessel
+from recon.vessel.model import FAT, FIBROUS, Fit, VesselModel
 
-__all__ = ["Leftover", "Texture", "beside", "leftover", "misfit", "scores_of", "texture"]
+__all__ = ["Leftover", "ResidualTexture", "beside", "leftover", "misfit", "scores_of", "texture"]
 
 Floats = NDArray[np.float64]
 
@@ -66,7 +66,7 @@ class Leftover:
 
 
 @dataclass(frozen=True, eq=False)
-class Texture:
+class ResidualTexture:
     """A Gaussian texture of the soft tissues.
 
     Attributes:
@@ -85,7 +85,7 @@ class Texture:
         return self.sd_hu * self.responses.get(name, 0.0)
 
 
-def _between_ends(vessel: Vessel) -> NDArray[np.bool_]:
+def _between_ends(vessel: VesselModel) -> NDArray[np.bool_]:
     """``(n,)`` voxels of the vessel but for its ends: where a vessel ends is no part of what is
     read of it."""
     low, high = vessel.start.ends
@@ -95,7 +95,7 @@ def _between_ends(vessel: Vessel) -> NDArray[np.bool_]:
     return kept
 
 
-def residual_of(vessel: Vessel, fit: Fit, data: Quadratic | None = None) -> Tensor:
+def residual_of(vessel: VesselModel, fit: Fit, data: Quadratic | None = None) -> Tensor:
     """b − Gx of the whole volume, ``grid.shape`` HU⁻¹; of other data than the fit's if they are
     given."""
     data = data or vessel.data
@@ -104,7 +104,7 @@ def residual_of(vessel: Vessel, fit: Fit, data: Quadratic | None = None) -> Tens
     return data.left(torch.from_numpy(image).to(data.b)[None])[0]
 
 
-def beside(data: Quadratic, vessel: Vessel, fit: Fit) -> Tensor | None:
+def beside(data: Quadratic, vessel: VesselModel, fit: Fit) -> Tensor | None:
     """What stands beside a fitted vessel, ``grid.shape`` HU above the fat; None where nothing is
     striking.
 
@@ -137,14 +137,14 @@ def beside(data: Quadratic, vessel: Vessel, fit: Fit) -> Tensor | None:
     return least_squares(data, left, _BESIDE_STEPS, mask, _BESIDE_HU**-2)
 
 
-def scores_of(vessel: Vessel, fit: Fit, explained: Tensor | float = 0.0) -> Floats:
+def scores_of(vessel: VesselModel, fit: Fit, explained: Tensor | float = 0.0) -> Floats:
     """How far each place stands out of what a fit leaves of the data, ``grid.shape`` standard
     deviations of the noise.
 
     0 at the vessel's ends: where a vessel ends is no part of what is read of it.
 
     Args:
-        vessel, fit: see :class:`recon.vessel.model.Vessel`.
+        vessel, fit: see :class:`recon.vessel.model.VesselModel`.
         explained: ``grid.shape`` HU⁻¹, G times what is known beside the fit.
     """
     scores = scores_in(vessel.data, residual_of(vessel, fit) - explained, _BODY_MM)
@@ -152,7 +152,7 @@ def scores_of(vessel: Vessel, fit: Fit, explained: Tensor | float = 0.0) -> Floa
     return scores
 
 
-def leftover(vessel: Vessel, fit: Fit) -> Leftover:
+def leftover(vessel: VesselModel, fit: Fit) -> Leftover:
     """Look through the whole volume for what the tissues do not explain: a second vessel, a branch,
     a stent, muscle.
 
@@ -175,7 +175,7 @@ def leftover(vessel: Vessel, fit: Fit) -> Leftover:
     )
 
 
-def misfit(vessel: Vessel, fit: Fit) -> tuple[float, float]:
+def misfit(vessel: VesselModel, fit: Fit) -> tuple[float, float]:
     """Mean square of the standardised residual over its expectation, and its standard deviation
     under the model."""
     at = vessel.gram.slices
@@ -204,7 +204,7 @@ def misfit(vessel: Vessel, fit: Fit) -> tuple[float, float]:
     return float((z**2).sum() / expected), math.sqrt(2.0 * total) / expected
 
 
-def texture(vessel: Vessel, fit: Fit, rng: np.random.Generator) -> Texture:
+def texture(vessel: VesselModel, fit: Fit, rng: np.random.Generator) -> ResidualTexture:
     """Variance of a texture in wall, fibrous layer and core, by the moment rᵀTr of the residual r
     (T its covariance).
 
@@ -250,10 +250,12 @@ def texture(vessel: Vessel, fit: Fit, rng: np.random.Generator) -> Texture:
         # An estimate is wᵀb with w = J C v; an image t adds (G w)ᵀ t.
         response = fit.curved @ (fit.covariance @ v).astype(np.float32)
         responses[name] = float(np.linalg.norm(smooth((soft * response)[:, None])))
-    return Texture(math.sqrt(max(float(mean), 0.0)), math.sqrt(max(float(top), 0.0)), responses)
+    return ResidualTexture(
+        math.sqrt(max(float(mean), 0.0)), math.sqrt(max(float(top), 0.0)), responses
+    )
 
 
-def _correlating(vessel: Vessel, length_mm: float) -> Callable[[NDArray[Any]], NDArray[Any]]:
+def _correlating(vessel: VesselModel, length_mm: float) -> Callable[[NDArray[Any]], NDArray[Any]]:
     """A symmetric function that makes of white noise one of unit variance with the correlation
     exp(−r² / 2ℓ²).
 

@@ -16,8 +16,8 @@ from threadpoolctl import threadpool_limits
 from recon.data_term import Quadratic
 from recon.vessel.core import CorePrior, CoreSpace
 from recon.vessel.data import grid_of, in_hu, pilot
-from recon.vessel.figures import Estimate, draws_of, estimate
-from recon.vessel.model import FIBROUS, Fit, Vessel
+from recon.vessel.figures import TissueEstimate, draws_of, estimate
+from recon.vessel.model import FIBROUS, Fit, VesselModel
 from recon.vessel.particles import Cloud, lead
 from recon.vessel.prior import VesselPrior
 from recon.vessel.quality import STRIKING, Leftover, beside, leftover, misfit, texture
@@ -70,7 +70,7 @@ class PlaqueReading:
         third_core: what is said of one more that the data show after that: ``at_mm``,
             ``volume_mm3``, ``contrast_hu``.
         calcifications: number of calcified bodies.
-        figures: name → :class:`recon.vessel.figures.Estimate`; the core's are missing where
+        figures: name → :class:`recon.vessel.figures.TissueEstimate`; the core's are missing where
             presence is below :data:`CERTAIN`, those of all plaque bodies where the tissues do not
             explain the data.
         refused: name → why a figure is missing.
@@ -94,9 +94,9 @@ class PlaqueReading:
     presence: float
     second_core: float
     calcifications: int
-    figures: Mapping[str, Estimate]
+    figures: Mapping[str, TissueEstimate]
     refused: Mapping[str, str]
-    given_core: Mapping[str, Estimate]
+    given_core: Mapping[str, TissueEstimate]
     regions: Mapping[str, NDArray[np.float32]]
     image: NDArray[np.float32]
     chi2: float
@@ -252,9 +252,9 @@ def read_plaque(
         )
     rng = np.random.default_rng(seed)
 
-    def fitted(seen: Quadratic) -> tuple[Vessel, Fit]:
+    def fitted(seen: Quadratic) -> tuple[VesselModel, Fit]:
         start = find_vessel(pilot(seen), grid_of(seen), None if where is None else np.array(where))
-        vessel = Vessel(seen, start, vessel_prior)
+        vessel = VesselModel(seen, start, vessel_prior)
         return vessel, vessel.fit(vessel.first_guess(), expected=True)
 
     data = in_hu(term)
@@ -288,7 +288,7 @@ def read_plaque(
     )
 
 
-def _calcified(vessel: Vessel, fit: Fit, particles: int, rng: np.random.Generator) -> Fit:
+def _calcified(vessel: VesselModel, fit: Fit, particles: int, rng: np.random.Generator) -> Fit:
     """The fit with the calcifications that the data show."""
     for _ in range(_MOST_BODIES):
         space = CoreSpace(vessel, fit, _CALCIFICATION)
@@ -312,7 +312,7 @@ def _calcified(vessel: Vessel, fit: Fit, particles: int, rng: np.random.Generato
 
 
 def _with_body(
-    vessel: Vessel,
+    vessel: VesselModel,
     fit: Fit,
     space: CoreSpace,
     cloud: Cloud,
@@ -331,7 +331,7 @@ def _with_body(
     )
 
 
-def _doubt(presence: float, contrast: Estimate) -> str:
+def _doubt(presence: float, contrast: TissueEstimate) -> str:
     """Why the figures of a core must not be given; empty: they may.
 
     Where two explanations are about as likely (which tissue is the core), the presence is certain
@@ -348,7 +348,7 @@ def _doubt(presence: float, contrast: Estimate) -> str:
 
 
 def _read(
-    vessel: Vessel,
+    vessel: VesselModel,
     fit: Fit,
     prior_of_core: CorePrior,
     particles: int,
@@ -399,7 +399,7 @@ def _read(
     for k in range(calcifications):
         i = vessel.size + k
         sd, value = math.sqrt(fit.covariance[i, i]), fit.parameters[i] + fit.parameters[FIBROUS]
-        given[f"calcification {k + 1}"] = Estimate(
+        given[f"calcification {k + 1}"] = TissueEstimate(
             value, value - 1.96 * sd, value + 1.96 * sd, sd, "HU"
         )
     if other_core is not None:
@@ -410,7 +410,9 @@ def _read(
             math.sqrt(fit.covariance[i, i]), tau.sd_of("contrast"), other_core["contrast_sd_hu"]
         )
         value = -float(fit.parameters[i])
-        given["second contrast"] = Estimate(value, value - 1.96 * sd, value + 1.96 * sd, sd, "HU")
+        given["second contrast"] = TissueEstimate(
+            value, value - 1.96 * sd, value + 1.96 * sd, sd, "HU"
+        )
     more, found = (
         (0.0, None)
         if presence < CERTAIN
@@ -476,7 +478,7 @@ def _probability(log_odds: float) -> float:
 
 
 def _one_more(
-    vessel: Vessel,
+    vessel: VesselModel,
     fit: Fit,
     core: NDArray[np.float32],
     space: CoreSpace,
@@ -532,7 +534,11 @@ def _core_told(
 
 
 def _regions(
-    vessel: Vessel, fit: Fit, space: CoreSpace, shares: NDArray[np.float32], calcifications: int
+    vessel: VesselModel,
+    fit: Fit,
+    space: CoreSpace,
+    shares: NDArray[np.float32],
+    calcifications: int,
 ) -> dict[str, NDArray[np.float32]]:
     core = np.zeros(len(vessel.index))
     core[space.chosen] = shares.mean(0)

@@ -17,7 +17,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from recon.analytic.inset import InsetFbp
-from recon.evaluate.vessels import Centreline, Vessel
+from recon.evaluate.vessels import PaintedVessel, VesselAxis
 from recon.jobs.store import Store
 from recon.least_squares.inset_problem import InsetProblem
 from recon.study.paper.plaque_scan import inset_grid
@@ -35,9 +35,9 @@ ROD_HU = {"fat": -92.65, "wall": 63.53, "fibrous": 103.22, "lumen": 479.97, "cor
 KERNELS = ("soft", "standard", "detail")
 _X, _Y, _Z = np.eye(3)
 _H = 0.5**0.5
-_HELD_OUT: dict[str, tuple[Centreline, dict[str, Any], tuple[float, ...]]] = {
+_HELD_OUT: dict[str, tuple[VesselAxis, dict[str, Any], tuple[float, ...]]] = {
     "along z": (
-        Centreline(_Z, -_X),
+        VesselAxis(_Z, -_X),
         {
             "vessel_diameter": 4.0,
             "wall_thickness": 0.25,
@@ -48,17 +48,17 @@ _HELD_OUT: dict[str, tuple[Centreline, dict[str, Any], tuple[float, ...]]] = {
         (0.0, 50.0, 92.0, 430.0, 30.0),
     ),
     "tilted": (
-        Centreline((_H, 0.0, _H), _Y),
+        VesselAxis((_H, 0.0, _H), _Y),
         {"vessel_diameter": 2.8, "bulge": 0.45, "core_semi_axes": (0.45, 0.7, 0.7)},
         (0.0, 45.0, 100.0, 380.0, 20.0),
     ),
     "in plane": (
-        Centreline(_Y, -_Z),
+        VesselAxis(_Y, -_Z),
         {"vessel_diameter": 3.0, "bulge": 0.5, "core_semi_axes": (0.5, 0.7, 0.9)},
         (0.0, 55.0, 90.0, 400.0, 45.0),
     ),
     "curved": (
-        Centreline(_X, _Z, 6.5),
+        VesselAxis(_X, _Z, 6.5),
         {"vessel_diameter": 3.6, "bulge": 0.5, "core_semi_axes": (0.55, 1.1, 0.8)},
         (0.0, 60.0, 110.0, 460.0, 40.0),
     ),
@@ -119,7 +119,7 @@ class Bench:
         found = self.store.piece(f"draws/{dose:g}_{k}", "1", compute)
         return torch.from_numpy(found["fbp"]), torch.from_numpy(found["b"])
 
-    def painted(self, vessel: Vessel, values: dict[str, float]) -> tuple[Tensor, Tensor]:
+    def painted(self, vessel: PaintedVessel, values: dict[str, float]) -> tuple[Tensor, Tensor]:
         """FBP and b of a vessel in any direction, on 0.1 mm voxels."""
         return self.projected(
             vessel.painted(self.fine, {k: h - values["patient"] for k, h in values.items()})
@@ -150,9 +150,9 @@ class Bench:
         if not core:
             values["core"] = values["fibrous"]
         kept = f"held_out_{name}" + ("" if core else "_without_core")
-        return self.vessel(kept, Vessel(line, self.grid.center, plaque=shape), values)
+        return self.vessel(kept, PaintedVessel(line, self.grid.center, plaque=shape), values)
 
-    def vessel(self, name: str, vessel: Vessel, values: dict[str, float]) -> Place:
+    def vessel(self, name: str, vessel: PaintedVessel, values: dict[str, float]) -> Place:
         """Of a vessel with a plaque."""
 
         def compute() -> dict[str, Any]:

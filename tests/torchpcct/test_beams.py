@@ -21,6 +21,7 @@ CHANGES = {
     "narrowed": lambda g: g.widened(-1, -3),
     "interleaved": lambda g: g.interleaved(),
     "another column offset": lambda g: g.with_column_offset(0.7),
+    "wider columns": lambda g: g.scaled(1.03),
     "other rows": lambda g: g.with_rows(1, 2),
 }
 

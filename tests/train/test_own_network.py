@@ -16,7 +16,7 @@ from recon.mbir.priors import network_of
 from recon.mbir.unrolled import Unrolled
 from recon.mbir.weights_io import read_tensors
 from train import __main__ as command_line
-from train.checkpoint import Store
+from train.checkpoint import CheckpointStore
 from train.config import TrainConfig
 from train.run import export
 
@@ -148,7 +148,7 @@ def test_a_checkpoint_alone_imports_nothing(nets, tmp_path, capsys):
     out = tmp_path / "run"
     out.mkdir()
     config = TrainConfig.from_yaml(f"network: {nets}:MyNet")
-    Store(out).save({}, {"config": config.to_yaml(), "state": {}})
+    CheckpointStore(out).save({}, {"config": config.to_yaml(), "state": {}})
     assert command_line.main(["--resume", "--out", str(out), "--no-progress"]) == 2
     said = capsys.readouterr().err
     assert f"trains {nets}:MyNet, which no file alone may import" in said

@@ -20,7 +20,7 @@ from tiny_training import (
 )
 
 from recon.mbir.weights_io import read_tensors
-from train.checkpoint import Store
+from train.checkpoint import CheckpointStore
 from train.processes import Group, gradient
 
 
@@ -83,7 +83,7 @@ def test_two_processes_give_the_gradients_of_one(tmp_path, launcher):
     # A whole run, interrupted by a signal to process 1 only and resumed.
     one = tmp_path / "one"
     run(one, config)
-    a, b = (Store(p).load()[0] for p in (one, tmp_path / "two"))
+    a, b = (CheckpointStore(p).load()[0] for p in (one, tmp_path / "two"))
     for name in a:
         torch.testing.assert_close(a[name], b[name], rtol=2e-3, atol=2e-4)
     assert [r["step"] for r in rows(tmp_path / "two" / "log.csv")] == [

@@ -27,7 +27,7 @@ from tiny_training import (
 from torch import nn
 
 from recon.mbir.weights_io import TensorFileError, read_tensors
-from train.checkpoint import CHECKPOINT_FORMAT, Store
+from train.checkpoint import CHECKPOINT_FORMAT, CheckpointStore
 from train.config import ObjectiveConfig
 from train.loop import train
 from train.run import DivergedError, rate_factor
@@ -73,7 +73,7 @@ def test_killed_run_resumed(tmp_path, uninterrupted):
         process.kill()
         process.wait()
     reached = int(rows(log)[-1]["step"])
-    state = Store(out).load()[1]["state"]
+    state = CheckpointStore(out).load()[1]["state"]
     assert 0 < state["step"] <= reached < STEPS
     run(out, resume=True)
     assert_same_run(out, uninterrupted)
@@ -159,7 +159,7 @@ DAMAGE = {
 def test_damaged_checkpoint_falls_back_to_the_previous_one(tmp_path, uninterrupted, damage, caplog):
     out = tmp_path / "x"
     run(out, objective=StubObjective({6: send(signal.SIGTERM)}))
-    store, spoil = Store(out), DAMAGE[damage]
+    store, spoil = CheckpointStore(out), DAMAGE[damage]
     older = read_tensors(store.previous, CHECKPOINT_FORMAT)[1]["state"]["step"]
     spoil(store.current)
     metadata, warning = store.load()[1:]
@@ -277,7 +277,7 @@ def test_average_of_weights(tmp_path):
             return super().__call__(model, batch, progress)
 
     run(tmp_path / "x", objective=Watch())
-    tensors, _, _ = Store(tmp_path / "x").load()
+    tensors, _, _ = CheckpointStore(tmp_path / "x").load()
     expected = seen[0]
     for step, weight in enumerate([*seen[1:], tensors["model.0.weight"]]):
         decay = min(0.9, (1 + step) / (10 + step))
@@ -291,7 +291,7 @@ def test_long_gradients_are_shortened(tmp_path):
     for clip in (1e-3, float("inf")):
         out = tmp_path / str(clip)
         run(out, stub_config(steps=1, clip=clip))
-        tensors = Store(out).load()[0]
+        tensors = CheckpointStore(out).load()[0]
         moments[clip] = torch.cat(
             [v.flatten() for k, v in tensors.items() if k.endswith(".exp_avg")]
         )
@@ -308,7 +308,7 @@ def test_steps_that_are_not_finite_are_skipped(tmp_path, bad):
     spoil = {0: lambda t: t * bad, 6: lambda t: t * bad, 7: lambda t: t + float("inf")}
     state, _ = run(tmp_path / "x", objective=StubObjective(spoil))
     assert (state.step, state.skipped) == (STEPS, 3)
-    tensors, _, _ = Store(tmp_path / "x").load()
+    tensors, _, _ = CheckpointStore(tmp_path / "x").load()
     assert all(torch.isfinite(t).all() for t in tensors.values())
     table = rows(tmp_path / "x" / "log.csv")
     assert [r["skipped"] for r in table[5:9]] == ["1", "2", "3", "3"]

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.checks.scan_test import UNKNOWN, ScanTest, check_lines
-from torchpcct.geometry import ConeBeam, Geometry
+from torchpcct.geometry import Geometry
 from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.validate import checked
 
@@ -155,9 +155,9 @@ def _gain_text(
 ) -> str:
     many = int(wrong.sum()) - 1
     what = f"column {column}" if width == 1 else f"columns {column} … {column + width - 1}"
-    if isinstance(g, ConeBeam) and wrong[:, column - width].mean() < 0.5:
+    if g.has_rows and wrong[:, column - width].mean() < 0.5:
         what += f" of row {row}"
-    more = f" (and {many} more)" if many > 0 and not isinstance(g, ConeBeam) else ""
+    more = f" (and {many} more)" if many > 0 and not g.has_rows else ""
     reads = "reads" if width == 1 else "read"
     return (
         f"{what}{more} {reads} {1.0 + size:.3g} ± {error * (1.0 + size):.1g} times what its "

@@ -51,7 +51,7 @@ from torch import Tensor
 from torchpcct.checks.ray_pairs import BLOCKS, RayPairs, product, unwrapped
 from torchpcct.checks.scan_test import UNKNOWN, ScanTest
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.geometry import ConeBeam, Geometry, view_step
+from torchpcct.geometry import Geometry, view_step
 from torchpcct.validate import checked
 
 __all__ = [
@@ -239,19 +239,9 @@ def _described(geometry: Any, name: str, size: float) -> Any:
     if name == "step":
         turned = unwrapped(geometry.angles)
         return replace(geometry, angles=turned[0] + (1.0 + size) * (turned - turned[0]))
-    cone = isinstance(geometry, ConeBeam)
-    pitch, offset = (
-        (geometry.pitch[1], geometry.offset[1]) if cone else (geometry.pitch, geometry.offset)
-    )
     if name == "centre":
-        offset = offset - size * pitch
-    else:
-        pitch, offset = (1.0 + size) * pitch, (1.0 + size) * offset
-    if cone:
-        return replace(
-            geometry, pitch=(geometry.pitch[0], pitch), offset=(geometry.offset[0], offset)
-        )
-    return replace(geometry, pitch=pitch, offset=offset)
+        return geometry.with_column_offset(geometry.column_offset - size * geometry.column_pitch)
+    return geometry.scaled(1.0 + size)
 
 
 def _unrolled(lines: Tensor, geometry: Any, window: DetectorWindow | None, roll: float) -> Tensor:

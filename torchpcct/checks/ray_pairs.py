@@ -20,7 +20,7 @@ from torch.nn import functional as F
 from torchpcct.checks.orbit_plane import PARTED, orbit_plane, shared_square
 from torchpcct.checks.scan_test import check_lines
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
+from torchpcct.geometry import ConeBeam, Geometry, view_step
 
 __all__ = ["BLOCKS", "OppositeRays", "Pattern", "RayPairs", "product", "unwrapped"]
 
@@ -121,7 +121,7 @@ class RayPairs:
         if name == "centre":
             return self.shifted()
         if name == "roll":
-            if not isinstance(self.rays.geometry, ConeBeam) or self.rays.window.rows < 3:
+            if not self.rays.geometry.has_rows or self.rays.window.rows < 3:
                 return None
             return 2.0 * self.heights()[:, None], "columns"
         gamma = self.rays.fan_angles(self.base)
@@ -267,7 +267,7 @@ def unwrapped(angles: Floats) -> Floats:
 
 
 def _check(lines: Tensor, geometry: Geometry, window: DetectorWindow) -> None:
-    expected = window.shape if isinstance(geometry, ConeBeam) else (window.views, window.columns)
+    expected = window.shape if geometry.has_rows else (window.views, window.columns)
     check_lines(lines, expected, window.views == geometry.views)
 
 
@@ -367,11 +367,11 @@ class OppositeRays:
 
     def __init__(self, geometry: Any, window: DetectorWindow, about: tuple[float, float]) -> None:
         self.geometry, self.window = geometry, window
-        self.parallel = isinstance(geometry, ParallelBeam)
+        self.parallel = geometry.parallel
         u = geometry.column_positions
-        self.flat = not isinstance(geometry, ConeBeam)
+        self.flat = not geometry.has_rows
         self.start, self.step = float(u[0]), float(u[1] - u[0]) if u.size > 1 else 1.0
-        self.rows = geometry.row_positions if isinstance(geometry, ConeBeam) else np.zeros(1)
+        self.rows = geometry.row_positions
         y, x = about
         self.radius, self.polar = math.hypot(x, y), math.atan2(y, x)
 

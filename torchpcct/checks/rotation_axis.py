@@ -14,7 +14,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from torchpcct.checks.opposite_rays import centre_test
 from torchpcct.checks.orbit_plane import orbit_plane
 from torchpcct.checks.ray_pairs import OppositeRays
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
+from torchpcct.geometry import ConeBeam, Geometry, view_step
 from torchpcct.readings import MEDIAN_TO_SD
 
 __all__ = ["RotationAxis", "at_axis", "axis_column", "rotation_axis"]
@@ -84,23 +84,15 @@ class RotationAxis:
 
 def axis_column(geometry: Any) -> float:
     """Column onto which the rotation axis projects, as the geometry describes it."""
-    pitch, offset = _of_columns(geometry)
+    pitch, offset = geometry.column_pitch, geometry.column_offset
     return float((geometry.columns - 1) / 2 - offset / pitch)
 
 
 def at_axis(geometry: Any, column: float) -> Any:
     """The geometry whose axis projects onto ``column``."""
-    pitch, _ = _of_columns(geometry)
-    offset = ((geometry.columns - 1) / 2 - column) * pitch
-    return replace(
-        geometry, offset=(geometry.offset[0], offset) if isinstance(geometry, ConeBeam) else offset
+    return geometry.with_column_offset(
+        ((geometry.columns - 1) / 2 - column) * geometry.column_pitch
     )
-
-
-def _of_columns(geometry: Any) -> tuple[float, float]:
-    if isinstance(geometry, ConeBeam):
-        return geometry.pitch[1], geometry.offset[1]
-    return geometry.pitch, geometry.offset
 
 
 def rotation_axis(lines: Tensor, geometry: Geometry) -> RotationAxis:
@@ -125,7 +117,7 @@ def rotation_axis(lines: Tensor, geometry: Geometry) -> RotationAxis:
         return _stated(
             found[0], found[1] * (1.0 if shares is not None else 2.0), LEAST, "opposite rays"
         )
-    if not isinstance(g, ParallelBeam):
+    if not g.parallel:
         few = (
             "hardly any line was measured twice, which tells the axis of a fan or cone beam: a "
             "full turn does"

@@ -11,7 +11,7 @@ import pytest
 
 from recon.evaluate.task import Task
 from recon.evaluate.tasks import TASKS, VesselTask, read_task
-from recon.evaluate.vessels import SHAPES, Vessel
+from recon.evaluate.vessels import SHAPES, PaintedVessel
 from recon.jobs.store import Store
 from torchpcct import VolumeGrid
 from torchpcct.scene.plaque import Plaque
@@ -68,7 +68,7 @@ def test_shares_of_every_painted_task_are_converged(name):
 def test_shares_of_all_vessels_are_converged(name, voxel_mm):
     line, branch = SHAPES[name]
     grid = VolumeGrid((round(9 / voxel_mm),) * 3, voxel_mm, (0.013, -30.38, -29.63))
-    assert off_by(Vessel(line, (0.0, -30.38, -29.63), branch), grid, HU, 150) < 0.5
+    assert off_by(PaintedVessel(line, (0.0, -30.38, -29.63), branch), grid, HU, 150) < 0.5
 
 
 @pytest.mark.slow
@@ -84,7 +84,10 @@ def test_shares_of_the_held_out_vessels_are_converged(direction, monkeypatch):
     grid = VolumeGrid((57, 45, 45), 0.2, (0.0, -30.38, -29.63))
     assert (
         off_by(
-            Vessel(line, grid.center, plaque=plaque), grid, dict(zip(HU, values, strict=True)), 150
+            PaintedVessel(line, grid.center, plaque=plaque),
+            grid,
+            dict(zip(HU, values, strict=True)),
+            150,
         )
         < 0.5
     )
@@ -92,7 +95,9 @@ def test_shares_of_the_held_out_vessels_are_converged(direction, monkeypatch):
 
 def test_painting_is_the_mean_of_the_values_and_bending_keeps_volumes():
     grid = VolumeGrid((10, 40, 40), 0.2)
-    straight, tilted = (Vessel(SHAPES[n][0], grid.center) for n in ("straight", "in_plane_x"))
+    straight, tilted = (
+        PaintedVessel(SHAPES[n][0], grid.center) for n in ("straight", "in_plane_x")
+    )
     shares = straight.shares(grid)
     exact = straight.straight.volume_fractions(grid, 40)
     assert np.abs(np.stack(list(shares.values())) - exact).max() < 0.02

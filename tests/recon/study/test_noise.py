@@ -13,8 +13,8 @@ from tiny_studies import TINY, assert_report_is_whole
 from recon.analytic.exact_noise import roi_adjoints, roi_covariance, voxel_covariance
 from recon.analytic.inset import InsetFbp
 from recon.study.noise import (
+    RoiStatistics,
     Settings,
-    Table,
     few_run_tables,
     measured_table,
     pair_differences,
@@ -142,7 +142,7 @@ def _covariance(seed=0):
 
 
 def exact_table(covariance):
-    return Table(MEAN, np.sqrt(np.diag(covariance)).reshape(MEAN.shape))
+    return RoiStatistics(MEAN, np.sqrt(np.diag(covariance)).reshape(MEAN.shape))
 
 
 def test_few_run_tables_have_the_moments_of_their_law():

@@ -140,7 +140,7 @@ def test_what_is_believed_of_the_vessel_reaches_the_fit(drawn, network, vessel, 
         seen.append(prior)
         raise ValueError("seen")
 
-    monkeypatch.setattr(known, "Vessel", refused)
+    monkeypatch.setattr(known, "VesselModel", refused)
     network.with_known(KnownVessel("a prior")).solve(vessel)
     assert seen == ["a prior"]
 

@@ -10,12 +10,12 @@ import torch
 from recon.vessel import layer
 from recon.vessel.data import grid_of, pilot
 from recon.vessel.layer import LENGTHS_MM, LayerEstimate, LayerField
-from recon.vessel.model import Vessel
+from recon.vessel.model import VesselModel
 from recon.vessel.start import find_vessel
 
 
 def fitted(data):
-    vessel = Vessel(data, find_vessel(pilot(data), grid_of(data), None))
+    vessel = VesselModel(data, find_vessel(pilot(data), grid_of(data), None))
     return vessel.fit(vessel.first_guess(), expected=True, tolerance=1e-3)
 
 
@@ -93,7 +93,7 @@ def test_contents_and_step_are_those_of_the_joint_mode(fit, dense):
 def test_a_step_that_leads_up_is_not_taken(fit, dense, monkeypatch):
     joint, right, B = dense
     p = len(fit.parameters)
-    monkeypatch.setattr(Vessel, "energy", lambda *a: (np.inf, None))
+    monkeypatch.setattr(VesselModel, "energy", lambda *a: (np.inf, None))
     found = LayerEstimate(fit)
     assert np.array_equal(found.fit.parameters, fit.parameters)
     contents = B @ np.linalg.solve(joint[p:, p:], right[p:])

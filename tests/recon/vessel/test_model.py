@@ -11,14 +11,14 @@ from drawn_vessel import INNER_MM, LUMEN_MM, VALUES, WALL_MM
 
 from recon.vessel.core import CorePrior, CoreSpace
 from recon.vessel.data import grid_of, in_hu, pilot
-from recon.vessel.model import FAT, FIBROUS, LUMEN, THICKNESS, Vessel
+from recon.vessel.model import FAT, FIBROUS, LUMEN, THICKNESS, VesselModel
 from recon.vessel.start import find_vessel
 
 
 @pytest.fixture(scope="module")
 def vessel(gram):
     data = drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0))
-    return Vessel(data, find_vessel(pilot(data), grid_of(data), None))
+    return VesselModel(data, find_vessel(pilot(data), grid_of(data), None))
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def test_fit_goes_to_the_mode_from_afar(gram, seed):
     """It stopped where a shortened step gained little: for seed 5 at 63 in the log posterior
     short of the mode."""
     data = drawn_vessel.data(gram, drawn_vessel.image(gram.finer, 0.0, samples=2), seed)
-    vessel = Vessel(data, find_vessel(pilot(data), grid_of(data), None))
+    vessel = VesselModel(data, find_vessel(pilot(data), grid_of(data), None))
     afar = vessel.first_guess()
     afar[vessel.lumen_part] *= 1.3
     afar[vessel.outer_part] *= 0.8
@@ -80,7 +80,7 @@ def test_fit_goes_to_the_mode_from_afar(gram, seed):
     assert found.energy - mode.energy < 0.6
 
 
-class Scripted(Vessel):
+class Scripted(VesselModel):
     """A model of one direction: its energy is a function of how far a step went."""
 
     def __init__(self, energy):

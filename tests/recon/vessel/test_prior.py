@@ -6,7 +6,7 @@ import pytest
 
 from recon.vessel import VesselPrior
 from recon.vessel.data import grid_of, pilot
-from recon.vessel.model import FIBROUS, WALL, Vessel
+from recon.vessel.model import FIBROUS, WALL, VesselModel
 from recon.vessel.start import find_vessel
 
 
@@ -41,7 +41,7 @@ def test_a_firm_belief_holds_and_a_loose_one_gives_way(seen):
     """Values far from the truth: pulled there with 1 HU of doubt, hardly with 100 HU."""
     fits = []
     for sd in (1.0, 100.0):
-        vessel = Vessel(*seen, VesselPrior((0.0, sd), (160.0, sd)))
+        vessel = VesselModel(*seen, VesselPrior((0.0, sd), (160.0, sd)))
         fits.append(vessel.fit(vessel.first_guess()).parameters)
     true = [drawn_vessel.VALUES[t] for t in ("wall", "fibrous")]
     off = [np.abs(p[[WALL, FIBROUS]] - true) for p in fits]
@@ -56,7 +56,7 @@ def test_a_belief_in_the_difference_alone_gives_way_together(seen):
     off = []
     for shift in (0.0, 200.0):
         means = [drawn_vessel.VALUES[t] + 100.0 for t in ("wall", "fibrous")]
-        vessel = Vessel(*seen, VesselPrior((means[0], 10.0), (means[1], 10.0), shift=shift))
+        vessel = VesselModel(*seen, VesselPrior((means[0], 10.0), (means[1], 10.0), shift=shift))
         found = vessel.fit(vessel.first_guess()).parameters[[WALL, FIBROUS]]
         off.append(np.abs(found - means + 100.0))
     assert off[0].max() > 40
@@ -65,7 +65,7 @@ def test_a_belief_in_the_difference_alone_gives_way_together(seen):
 
 def test_orders_are_those_of_both_outlines(seen):
     for orders in (2, 3, 4):
-        vessel = Vessel(*seen, VesselPrior(orders=orders))
+        vessel = VesselModel(*seen, VesselPrior(orders=orders))
         guess = vessel.first_guess()
         assert (
             vessel.lumen_shape(guess).shape[1]

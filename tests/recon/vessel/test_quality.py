@@ -14,7 +14,7 @@ from scipy import ndimage
 from recon.vessel import read_plaque, reading
 from recon.vessel.data import grid_of, pilot
 from recon.vessel.data import scores as scores_in
-from recon.vessel.model import Vessel
+from recon.vessel.model import VesselModel
 from recon.vessel.quality import LENGTH_MM, PRIOR_VARIANCE_HU2, STRIKING, Leftover, misfit, texture
 from recon.vessel.report import save, table
 from recon.vessel.start import find_vessel
@@ -23,7 +23,7 @@ from torchpcct.volume import Volume
 
 def fitted(gram, volume, seed):
     data = drawn_vessel.data(gram, volume, seed)
-    vessel = Vessel(data, find_vessel(pilot(data), grid_of(data), None))
+    vessel = VesselModel(data, find_vessel(pilot(data), grid_of(data), None))
     fit = vessel.fit(vessel.first_guess())
     body = np.zeros((1, len(vessel.index)))
     return vessel, vessel.fit(np.append(fit.parameters, 0.0), body)

@@ -11,7 +11,7 @@ from refusals import refused
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from recon.vessel import read_plaque, reading
-from recon.vessel.figures import Estimate
+from recon.vessel.figures import TissueEstimate
 from recon.vessel.reading import _doubt
 from recon.vessel.report import save, table
 
@@ -107,7 +107,7 @@ def test_refusals(gram):
     ],
 )
 def test_doubt_has_a_reason(presence, low, high, why):
-    found = _doubt(presence, Estimate((low + high) / 2, low, high, (high - low) / 4, "HU"))
+    found = _doubt(presence, TissueEstimate((low + high) / 2, low, high, (high - low) / 4, "HU"))
     assert why in found
     assert bool(found) == bool(why)
 
