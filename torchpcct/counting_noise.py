@@ -38,15 +38,25 @@ __all__ = [
 ]
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+"""2⁶⁴ over the golden ratio: the increment of SplitMix64 (Steele, Lea and Flood 2014, OOPSLA)."""
 _MIX1 = np.uint64(0xBF58476D1CE4E5B9)
+"""First multiplier of its mixing (Stafford's variant 13)."""
 _MIX2 = np.uint64(0x94D049BB133111EB)
+"""Second multiplier."""
 _S30 = np.uint64(30)
+"""First shift of its mixing, bits."""
 _S27 = np.uint64(27)
+"""Second shift, bits."""
 _S31 = np.uint64(31)
+"""Third shift, bits."""
 _S11 = np.uint64(11)
+"""Bits that a float64 in 0 … 1 has no room for."""
 _OPERATIONS = 50  # about those of a random number
+"""Operations of a random number, about: for the choice of threads."""
 _TO_UNIT = 1.0 / 9007199254740992.0  # 2**-53
+"""2⁻⁵³: from 53 random bits to 0 … 1."""
 _BELOW_ONE = 1.0 - _TO_UNIT
+"""The largest float64 below 1."""
 _NORMAL = 1e12
 """Mean from which on Poisson numbers are drawn as normal ones: their skewness is a millionth, and
 the logarithms of probabilities would lose their last digit to rounding."""
@@ -238,12 +248,15 @@ def _compound_rows(
 
 
 _QUANTA = 0
+"""Stream of the random numbers of a reading's quanta; each purpose has its own."""
 _ELECTRONICS = 1
+"""Of its electronic noise."""
 _THINNING = 2
+"""Of the photons that a scan of lower dose loses."""
 _THINNED_ELECTRONICS = 3
+"""Of the electronic noise that is added to it."""
 _SPLIT = 4
-"""Purposes of a reading's random numbers: each has a stream of its own; the last and all after it
-are those of the bins of :func:`split`."""
+"""This and all after it: of the bins of :func:`split`."""
 
 
 def seed_key(seed: int, purpose: int = _QUANTA) -> Any:

@@ -50,9 +50,13 @@ LEFTOVER = re.compile(r"\.(?P<process>\d+)-(?P<machine>[0-9a-f]{6})-[0-9a-f]{8}\
 """Names of what is being written begin so: the process, where it runs, and a number of this
 write alone."""
 _BLOCK = 512
+"""Bytes in front of an HDF5 file that hold its checksum: the smallest user block."""
 _ABANDONED_S = 60.0
+"""Seconds without a write after which a temporary file counts as abandoned."""
 _MAGIC = b"torchpcct, HDF5 from byte 512, SHA-256 of it: "
+"""Beginning of that block."""
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+"""First bytes of an HDF5 file."""
 
 VERSION = "0.2.0"
 """Version of this software. pyproject.toml reads it from here; files carry it."""

@@ -41,9 +41,10 @@ __all__ = [
 Floats = NDArray[np.float64]
 
 _DEGREES_SPAN_RAD = 20.0
+"""Range of angles from which on they may be degrees taken as rad: more than three turns."""
 _DEGREES_STEP_RAD = 0.04
-"""Angles over more than three turns in steps of 2.3° and more: 20 and more degrees, up to 9000
-views a turn, taken as rad. Helical scans of as many turns have far smaller steps."""
+"""Together with steps of so many rad and more (2.3°): 20 and more degrees, up to 9000 views a turn,
+taken as rad. Helical scans of as many turns have far smaller steps."""
 
 
 @checked

@@ -45,15 +45,17 @@ _SILENT_VIEWS = 8
 _DARK = 1e-3
 """Cells that read no more in air than this share of the median cell are dead."""
 FEWEST = 0.3
+"""Expected counts from which on the logarithm is corrected: see :func:`log_bias`."""
 MANY = 10.0
-"""Expected counts between which the logarithm is corrected: see :func:`log_bias`."""
+"""Expected counts up to which it is."""
 _AVERAGED = 10.0
 """Readings that :func:`smoothed` averages over in effect, of a sinogram; of a cone beam 26."""
 _FEW = 1000.0
+"""Readings in air below which half a photon matters."""
 _NO_PHOTONS = 0.1
+"""Variance over mean below which what was read are no photons."""
 _NO_COUNTS = 2.0
-"""Readings in air below which half a photon matters; variance over mean below which what was read
-are no photons; readings in air that cannot be counts: transmissions."""
+"""Readings in air that cannot be counts: transmissions."""
 DIM = 20.0
 """Photons of a reading below which its noise is far from normal."""
 TRANSFER_FRAMES = 4

@@ -107,7 +107,9 @@ def panels(
 
 
 _LEAST_STEP_HU = 0.1
+"""Finest step of the values in a page, HU."""
 _MOST_VOXELS = 2**26
+"""Voxels of a page at most."""
 _CODES = 65535
 """Of a volume in a page: 0 … 65534 are values, 65535 stands for what is none (NaN, infinity)."""
 

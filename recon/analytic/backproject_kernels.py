@@ -21,8 +21,11 @@ from numba import njit
 __all__ = ["ROWS", "backproject_2d", "backproject_3d", "spread_2d", "spread_3d"]
 
 PARALLEL = 0
+"""Kind of a parallel beam."""
 FLAT = 1
+"""Kind of a divergent beam on a flat detector."""
 CURVED = 2
+"""Kind of a divergent beam on a curved detector."""
 ROWS = 16
 """Rows of a task of :func:`backproject_2d`."""
 

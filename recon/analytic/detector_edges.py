@@ -28,11 +28,13 @@ Floats = NDArray[np.float64]
 G = TypeVar("G", bound=Geometry)
 
 _CUT = 0.03
+"""Rows are cut off if their end exceeds this fraction of the highest line integral."""
 _CUT_VIEWS = 0.05
-"""Rows are cut off if their end exceeds a share of the highest line integral in more than a
-share of the views."""
+"""In more than this fraction of the views."""
 _CUT_RANGES = 40
+"""Ranges of the views over which the ends are averaged."""
 _LEFT_OUT = 0.1
+"""Weight relative to the other end below which an end does not count."""
 _FEWEST_COLUMNS = 4
 """Readings that a cylinder is fitted to at least; rows of fewer are not continued."""
 _WIDEST_RAD = math.radians(85.0)

@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 __all__ = ["add_info", "add_view"]
 
 _PICTURE_ENDINGS = (".png", ".pdf", ".svg")
+"""Endings of pictures."""
 _LEAST_HU = 20.0
+"""Range of values above which a volume without a unit is taken to be in HU."""
 _SCALE_OF_CHANGES = 0.0, 200.0
 """Level and window in HU of what a drawn vessel has changed."""
 """A volume whose values lie closer together is not in HU, whatever its file says (most do not

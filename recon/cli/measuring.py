@@ -60,6 +60,7 @@ _STUDY_TASKS = (
     "rod",
     "lumen",
 )
+"""Tasks of ``dose-factor``."""
 _STUDY_METHODS = (
     "fbp:soft",
     "fbp:standard",

@@ -54,6 +54,7 @@ __all__ = [
 ]
 
 SCAN_ENDINGS = (".h5", ".hdf5")
+"""Endings of scan files."""
 _BESIDE = (".json", ".yaml")
 """Endings of summary and configuration, which :func:`tell` adds to the name of the result."""
 
@@ -62,16 +63,19 @@ Commands = Any
 
 
 _COMMON = "common options"
+"""Heading of the options that all commands have."""
 _SEED = {"low": 0, "high": 2**62}
+"""Limits of a seed."""
 MOST = 4096
 """More processes or threads than a machine has use for."""
 MANY = 10**6
 """More views, realisations or particles than anything here can hold."""
 LENGTH: dict[str, Any] = {"positive": True, "high": 1e12, "unit": "mm"}
+"""Limits of lengths: scans of any unit of length pass, slips of a power of ten by far do not."""
 EXPOSURE: dict[str, Any] = {"positive": True, "high": 1e6, "unit": "s"}
+"""Limits of exposures."""
 PLACE: dict[str, Any] = {"low": -1e12, "high": 1e12, "unit": "mm"}
-"""Limits of lengths and positions: scans of any unit of length pass, slips of a power of ten by
-far do not."""
+"""Limits of positions, as of lengths."""
 FORCE = ("--force", bool, None, "replace a file that another command or software has made")
 
 

@@ -57,9 +57,11 @@ if TYPE_CHECKING:
 __all__ = ["add_lower_dose", "add_reconstruct", "add_show_config", "add_simulate", "grid_of_scan"]
 
 _PAPER_VIEWS = 1968
+"""Views of a turn in the paper."""
 MOST_VOXELS = 2**31
 """Of a volume, 8 GiB: what is asked for beyond is a slip of the voxel size."""
 _NO_SIZE = " (the file does not know their size: --pitch MM)"
+"""Said of a file of unknown pixels."""
 _DONE = ".done"
 """Ending of the note beside a finished volume of many."""
 _FBP_RATE = 1e8

@@ -46,14 +46,17 @@ __all__ = ["Settings", "checks", "figures", "measure"]
 Floats = NDArray[np.float64]
 
 BOWTIES = ("large", "large+roi")
+"""Names of the bowties that are compared."""
 
 HALF_FAN_RAD = 0.32
 """Half-angle of the fan: holds the thorax with the heart at the isocentre (radius 190 mm)."""
 
 CALIBRATION_ORDER = 5
+"""Beam-hardening correction as published: order of the polynomial."""
 CALIBRATION_STEP_MM = 10.0
+"""Steps of water, mm."""
 CALIBRATION_MAX_MM = 380.0
-"""Beam-hardening correction as published: 5th order, 10 mm steps of water up to 380 mm."""
+"""Thickest water, mm."""
 
 PIXEL_MM = 0.78
 """Voxels of the paper's images."""
@@ -66,10 +69,13 @@ HEART_DISC_MM = 8.0
 """Radius of the disc of heart muscle at the isocentre whose noise is compared."""
 
 _THORAX_CENTER = (-34.0, -14.0)
+"""Centre of the thorax, (y, x) mm."""
 
 DETECTORS = ("eid", "silicon")
+"""Detectors of the two scanners."""
 
 _SIDES = tuple(f"rib_{side}_{k}" for side in ("left", "right") for k in (1, 2, 3))
+"""Beginnings of the names of the ribs at the sides."""
 TISSUES: dict[str, tuple[str, ...]] = {
     "side ribs": _SIDES,
     "all ribs": ("rib_",),

@@ -182,6 +182,7 @@ _QUESTIONS = (
     ("contrast of the lesion", "dose factor: contrast at slope 1", "lesion"),
     ("noise of a voxel in fat", "dose factor: noise", "patient"),
 )
+"""Questions: title, figure and place of each dose factor."""
 _BEYOND = 1000.0
 """Intervals are drawn to this factor, and its inverse."""
 

@@ -31,17 +31,22 @@ __all__ = ["Settings", "checks", "figures", "measure"]
 Floats = NDArray[np.float64]
 
 PUBLISHED_DQE = 0.68
+"""Density-imaging performance at a lowest threshold of 0 keV relative to an ideal detector, of an
+edge-on silicon detector: Grönberg, Yin, Maltz, Pelc and Persson, "The effects of intra-detector
+Compton scatter on zero-frequency DQE for photon-counting CT using edge-on-irradiated silicon
+detectors", arXiv 2206.04164 (2022)."""
 PUBLISHED_SLOPE = 0.017
-"""Density-imaging performance at a lowest threshold of 0 keV relative to an ideal detector, and its
-fall per keV, of an edge-on silicon detector: Grönberg, Yin, Maltz, Pelc and Persson, "The effects
-of intra-detector Compton scatter on zero-frequency DQE for photon-counting CT using
-edge-on-irradiated silicon detectors", arXiv 2206.04164 (2022)."""
+"""Its fall per keV of the threshold, from the same paper."""
 
 THRESHOLDS_KEV = (0.0, 2.5, 5.0, 7.5, 10.0, 15.0)
+"""Lowest thresholds that are compared, keV."""
 ENERGIES_KEV = (20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 100.0, 120.0)
+"""Energies of the photons that are followed, keV."""
 
 EXPOSURE_S = 0.35
+"""One rotation, s."""
 FAT_MM = 240.0
+"""Fat of the patient, mm."""
 INSET_MM = 3.36
 """Vessel diameter: the path of the contrast that pile-up and charge sharing may change."""
 

@@ -55,6 +55,7 @@ from torchpcct.viz import WINDOW_HU, Panel, panels
 __all__ = ["Settings", "checks", "figures", "measure"]
 
 METHODS = {"fbp": "FBP", "pwls": "q-GGMRF PWLS", "mbir": "MBIR (learned prior)"}
+"""Methods and their names in tables."""
 
 _TOLERANCE = 20.0
 """Largest error of a measure in per cent that the paper accepts (its resolution study)."""

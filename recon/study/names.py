@@ -15,6 +15,7 @@ from torchpcct.validate import choice, meant
 __all__ = ["case_names", "check_case", "check_setting", "setting_names"]
 
 _HERE = Path(__file__).parent
+"""Folder of the studies."""
 _TABLES = {"_PLAQUE": "", "_BODY": "body-", "_CONE": "cone-"}
 """Of ``hardcases/cases.py``, in their order, and what stands before their names."""
 

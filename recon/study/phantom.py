@@ -28,17 +28,21 @@ from torchpcct.viz import Panel, panels
 __all__ = ["Settings", "checks", "figures", "measure"]
 
 TRANSMITTED = "100 kVp behind 24 cm fat"
+"""Spectrum behind the patient for which CT numbers are checked."""
 MIDDLE = "64 keV"
-"""Spectra whose CT numbers are checked."""
+"""Energy for which CT numbers are checked."""
 
 _LENGTH_MM = 0.02
+"""Accepted error of a length, mm."""
 _OFFSET_MM = 0.1
-"""Accepted error of a length; of those that the paper gives with one decimal, in cm and in mm."""
+"""Accepted error of a length that the paper gives with one decimal, mm."""
 
 _SOFT_HU = 6.0
+"""Accepted difference of soft tissue from the paper's CT number, HU."""
 _BLOOD_HU = (400.0, 600.0)
+"""Accepted CT numbers of blood, HU."""
 _FAT_HU = (-130.0, -85.0)
-"""Accepted CT numbers: of soft tissue about the paper's, of blood and of fat."""
+"""Accepted CT numbers of fat, HU."""
 
 _SHOWN_KEV = 64.0  # of the picture: there the soft tissues have the paper's CT numbers
 _PIXEL_MM = 0.02

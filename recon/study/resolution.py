@@ -58,12 +58,16 @@ from torchpcct.viz import panels
 __all__ = ["Settings", "checks", "figures", "measure"]
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
+"""Full width at half maximum of a Gaussian of unit standard deviation."""
 _PX_FWHM = FWHM_PER_SIGMA * PROTOCOL_PIXEL_MM
+"""The same of one pixel's, mm."""
 _STEP_PX = 1.25
+"""Step of the blurs, pixels: so exactly limits are known."""
 
 _MIDDLE_ROWS = 12
+"""Detector rows of scans of which the middle slice alone is read."""
 _MIDDLE_SLICES = 21
-"""Detector rows and slices of scans of which the middle slice alone is read."""
+"""Slices of such scans."""
 
 _WIRE_RADIUS_MM = 0.03
 _WIRE_PIXEL_MM = 0.02

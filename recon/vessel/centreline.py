@@ -32,9 +32,11 @@ _AHEAD_MM = np.array([[0.5], [1.0], [1.5], [2.0]])
 _SMOOTH_MM = 1.0
 """Length along the vessel below which bends of the points found are taken for noise."""
 _FINE_MM = 0.05
+"""Spacing of the points of the line's table, mm."""
 _MOST_STEPS = 400
+"""Sections of a walk along a vessel at most."""
 _RIM_MM = 0.5
-"""The walk ends so far from the rim of the volume."""
+"""The walk ends so far from the rim of the volume, mm."""
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,11 @@ __all__ = ["grid_of", "in_hu", "least_squares", "pilot", "scores"]
 Floats = NDArray[np.float64]
 
 _PILOT_SD_MM = 0.25
+"""Standard deviation of the Gaussian filter of the pilot estimate, mm."""
 _PILOT_STEPS = 4
+"""Conjugate gradients of the pilot estimate."""
 _FLOOR = 0.02
-"""Of the spectrum that preconditions, as a share of its largest value."""
+"""Of the spectrum that preconditions, relative to its largest value."""
 
 
 def in_hu(term: Quadratic) -> Quadratic:

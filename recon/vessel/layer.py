@@ -42,9 +42,11 @@ LENGTHS_MM = (0.7, 0.7, 0.4)
 held-out vessels 0.5 mm in all directions have the same slope, but need 1.23 (2 s) and 1.15 times
 (0.35 s) the dose for the same noise of a core's centre."""
 _LEAST_SHARE = 1e-3
+"""Volume fraction of the layer from which on a voxel takes part."""
 _STEPS = 60
+"""Conjugate gradients at most."""
 _TOLERANCE = 2e-3
-"""Conjugate gradients at most, and the residual's norm over the first: half an HU of the limit."""
+"""Norm of the residual relative to the first at which they end: half an HU of the limit."""
 
 
 class LayerField:

@@ -39,32 +39,40 @@ __all__ = ["FAT", "FIBROUS", "LUMEN", "THICKNESS", "WALL", "Drawing", "Fit", "St
 Floats = NDArray[np.float64]
 
 FAT = 0
+"""Position of fat's value among the parameters."""
 WALL = 1
+"""Of the wall's value."""
 FIBROUS = 2
+"""Of the fibrous tissue's value."""
 LUMEN = 3
+"""Of the lumen's value."""
 THICKNESS = 4
+"""Of the logarithm of the wall's thickness."""
 BLUR = 5
+"""Of the logarithm of the edges' blur."""
 ENDS = 6
+"""Of the first of six: position and two tilts of the plane at either end."""
 _FIRST = 12
-"""Positions of the first parameters: values, logs of the wall thickness and of the edges' blur,
-three for each end (position and tilts of a plane); then the lumen's and the outer outline's
-coefficients."""
+"""Of the first coefficient of the lumen's outline; those of the outer outline follow."""
 
 _FAT_SD = 100.0
+"""Standard deviation of fat's prior about what the start reads, HU."""
 _LUMEN_SD = 300.0
-"""Prior of fat and lumen about what the start reads, HU."""
+"""Standard deviation of the lumen's prior about what the start reads, HU."""
 _EXPECTED_SD = (10.0, 15.0)
 """Of wall and fibrous tissue, HU, in a fit that expects them to be what they usually are."""
 _EXPECTED_ROUND = 4.0
 """So much less than else the outlines leave an ellipse in such a fit: a calcification beside the
 lumen would otherwise be taken for a bulge of it, and leave no trace."""
 _WALL_MM = 0.2
+"""Median of the wall thickness' prior, mm."""
 _WALL_LOG_SD = 0.2
+"""Standard deviation of its logarithm."""
 _BLUR_MM2 = 0.004
+"""Median of the prior of the variance by which edges are softer than the operator's, mm²: a focal
+spot of 0.5 mm makes 0.004 mm² at half of the distance to the detector, one of 1 mm makes 0.016."""
 _BLUR_LOG_SD = 0.7
-"""Variance by which edges are softer than the operator's, and standard deviation of its logarithm:
-a focal spot of 0.5 mm makes 0.004 mm² at half of the distance to the detector, one of 1 mm makes
-0.016."""
+"""Standard deviation of its logarithm."""
 SOFT = 0.5
 """Standard deviation of an outline as drawn, in voxels: narrower aliases, wider needs more of
 what noise hides."""
@@ -78,6 +86,8 @@ voxel."""
 EXCESS = SOFT**2 + BOX
 """Variance of outline and operator together, in squared voxels."""
 _END_SD_MM = (1.0, 0.1, 0.1)
+"""Standard deviations of the prior of an end: its position in mm, and the two tilts of its plane.
+"""
 _FAR = 15.0
 """A step that gains more of the log posterior than this, or less than half of what its linear model
 says, makes the curvature worth computing again."""

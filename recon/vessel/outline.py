@@ -18,6 +18,7 @@ __all__ = ["Outline", "OutlineAt"]
 Floats = NDArray[np.float64]
 
 _KNOT_MM = 0.9
+"""Distance of the knots of the cubic splines along the vessel, mm."""
 _CORRELATION_MM = 2.0
 """ℓ of the prior's correlation along the vessel, Matérn's of order 5/2: smooth, but for sudden
 bends."""

@@ -29,23 +29,28 @@ LENGTH_MM = 0.3
 PRIOR_VARIANCE_HU2 = 50.0
 """Mean of the exponential prior of the texture's variance, HU²."""
 _PROBES = 16
+"""Random probes of Hutchinson's estimate of a trace."""
 _ENDS_MM = 0.8
+"""So much at either end of the vessel is not tested, mm."""
 _BODY_MM = (0.4, 1.2)
-"""Gaussians whose difference finds a body of half a millimetre to some millimetres, such as a
-second vessel."""
+"""Standard deviations of two Gaussians, mm, whose difference finds a body of half a millimetre to
+some millimetres, such as a second vessel."""
 STRIKING = 6.5
 """Standard deviations of the noise; noise alone reached 4.8 in four volumes, sound readings
 reached 5.4."""
 _SHARE = 0.25
+"""What lies outside of the vessel shows where a smooth estimate exceeds this fraction of its
+largest value."""
 _SEEN_HU = 60.0
-"""What is beside shows where a smooth estimate has this share of its height, and so much."""
+"""And at least so much, HU."""
 _APART_MM = 0.2
+"""It keeps this distance from the vessel's wall, mm."""
 _EDGE_MM = 0.4
-"""What is beside keeps this distance from the vessel's wall, and reaches so far beyond where it
-shows."""
+"""And reaches so far beyond where it shows, mm."""
 _BESIDE_HU = 500.0
+"""Prior standard deviation of its voxels, HU."""
 _BESIDE_STEPS = 20
-"""Prior standard deviation of its voxels; conjugate gradients."""
+"""Conjugate gradients of its estimate."""
 
 
 @dataclass(frozen=True)

@@ -37,23 +37,30 @@ _MISFIT = 4.0
 CALCIFIED_HU = 300.0
 """A body of more contrast is a calcification."""
 _CALCIFICATION = CorePrior(1000.0, (0.25, 0.25, 0.4), 0.5, 0.25, 0.05, 0.7)
+"""Prior of a calcification, as of a core."""
 _LOOK = 400
+"""Trial bodies that are drawn from the prior to see whether one is worth looking for."""
 _LEAST_LOG = 8.0
 """Log evidence of a trial body that makes it worth looking for a calcification."""
 _MOST_BODIES = 3
+"""Plaque bodies beside the core that are looked for at most."""
 _BESIDE = "a second vessel, a branch, muscle"
+"""What may be outside of a vessel, for messages."""
 _INSIDE = "more plaque bodies, a stent, another shape"
+"""What may be inside of it, for messages."""
 _ROUNDS = 2
 """Times that what stands beside the vessel is estimated and taken off the data."""
 _APART = 0.2
+"""Fraction of its volume that a second core shares with the first at most."""
 _WORTH = 0.7
-"""A second core shares at most so much of its volume with the first; from this probability on, by a
-few hundred trials, it is looked for with care."""
+"""Probability of a second core, by a few hundred trials, from which on it is looked for with care.
+"""
 _PURE = 0.95
+"""Volume fraction of a tissue in the voxels that are read in other volumes."""
 _FEW = 8
+"""So many such voxels are enough."""
 _LESS_PURE = 0.8
-"""Share of a tissue in voxels that are read in other volumes; where there are too few, the
-second."""
+"""The fraction where there are fewer."""
 
 
 @dataclass(frozen=True, eq=False)

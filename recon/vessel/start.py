@@ -20,17 +20,19 @@ _BALLS_MM = (1.8, 0.9)
 """Larger than any lumen's radius; and for a narrow one, whose noise along it holds the walk of a
 large ball back."""
 _LEAST_STEP_HU = 120.0
+"""Least difference of the lumen from its surroundings, HU."""
 _LEAST_LUMEN_HU = 270.0
-"""Where the lumen stands out less, its outline is that of the noise: fibrous tissue is up to 240
-HU above fat."""
+"""Difference below which the outline of the lumen is that of the noise, HU: fibrous tissue is up to
+240 HU above fat."""
 _LUMEN_AT = 0.69
+"""Between the surroundings (0) and the lumen (1): half-way between fibrous tissue and lumen, where
+the lumen's outline is first looked for, wherever the scanner's zero lies."""
 _WALL_AT = 0.175
-"""Where between the surroundings and the lumen their outlines are first looked for: half-way
-between fat and wall, half-way between fibrous tissue and lumen, wherever the scanner's zero lies.
-"""
+"""The same half-way between fat and wall, for the outer outline."""
 _LEAST_LENGTH_MM = 2.0
+"""Shortest line that is taken for a vessel, mm."""
 _LEAST_SECTIONS = 4
-"""A line needs so many points."""
+"""Points that such a line needs."""
 
 
 def find_vessel(pilot: Floats, grid: VolumeGrid, point: Floats | None) -> Start:

@@ -40,6 +40,7 @@ _LEFT_OUT = (
     "focal spot, gantry turn during a view, scatter; voxels are uniform, and edges as "
     "coarse as they are"
 )
+"""What is not simulated of a scene of voxels, for its plan."""
 VIEWS_AT_A_TIME = 64
 """Views whose readings are computed, and kept, together."""
 

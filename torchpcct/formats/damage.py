@@ -43,15 +43,19 @@ def needed(package: str) -> Any:
 
 
 _MOST_TEXT = 2**24
+"""Characters of a YAML file at most, 16 MiB."""
 _LONGEST_TEXT = 2**14
+"""Characters of one text or number in it at most."""
 _MOST_VALUES = 2**20
+"""Values in it at most: a million numbers (twelve of each of 87 000 views)."""
 _DEEPEST_YAML = 32
-"""Of a YAML file: 16 MiB, a million numbers (twelve of each of 87 000 views)."""
+"""Its deepest nesting."""
 _LONGEST_TABLE = 2**28
 """Bytes of a text file of numbers."""
 _MOST_EXPANSION = 200
+"""How many times as small as its content a packed file may be."""
 _SMALL = 2**30
-"""No scan or volume of more bytes than the second is packed into a file so many times as small."""
+"""Bytes up to which that does not matter: no scan or volume of more is packed so much."""
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF16_LE, "utf-16"),

@@ -33,6 +33,7 @@ _PIXEL = (
     "measurement/instrument/detector/x_pixel_size",
     "measurement/instrument/detector/pixel_size_x",
 )
+"""Where Data Exchange files keep the size of a pixel, the first that is there."""
 _HALF_TURNS = 4
 """Angles without a unit that end within a step of so many half turns, or fewer, are in rad."""
 _LARGEST_RAD = 7.0

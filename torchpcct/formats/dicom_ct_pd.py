@@ -46,6 +46,7 @@ _TAGS = {
     "water": 0x70411001,
     "photons": 0x70331065,
 }
+"""Private tags of DICOM-CT-PD (Chen et al. 2015, Med. Phys. 42:6964)."""
 _SAME_SPOT = (2e-5, 0.01, 0.01)
 """Differences of deflections (rad, mm, mm) that are those of one position."""
 _TURN_MM = 0.05

@@ -33,22 +33,27 @@ _LOG = logging.getLogger(__name__)
 DICOM_ENDINGS = (".dcm", ".ima")
 """Of files that are DICOM whatever is in them."""
 _PREAMBLE = 128
+"""Bytes before a DICOM file's mark."""
 _MARK = b"DICM"
+"""That mark."""
 _DIRECTORY = b"1.2.840.10008.1.3.10"
 """Class of a DICOMDIR, which lists files and has no pixels."""
 _DEFLATED = "1.2.840.10008.1.2.1.99"
+"""Transfer syntax whose whole data set is packed."""
 _MOST_INFLATED = 2**27
-"""Transfer syntax whose whole data set is packed, and bytes that it may have: an image of 8192²
-pixels."""
+"""Bytes that such a data set may have: an image of 8192² pixels."""
 _CT_CLASS = "1.2.840.10008.5.1.4.1.1.2"
 """CT Image Storage, and the beginning of its enhanced classes."""
 _MADE_BY = "torchpcct"
+"""Manufacturer in files that are written."""
 _HU_RANGE = (-32768, 32767)
+"""Values of 16 bits, HU at a slope of 1."""
 _ROUNDED = 1e-9
 """Relative, of a decimal string of ten digits."""
 _LOWEST = -1024.5
+"""Below it no tissue and no air reads, HU."""
 _AIR = -1000.0
-"""HU below which no tissue and no air reads, and those of air."""
+"""CT number of air, HU."""
 
 
 # --- files ----------------------------------------------------------------------------------------

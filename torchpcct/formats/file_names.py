@@ -13,8 +13,9 @@ from pathlib import Path
 __all__ = ["in_number_order", "matching"]
 
 _WHOLE = re.compile(r"\d+")
+"""Whole numbers in a name."""
 _DECIMAL = re.compile(r"(?:(?<![0-9A-Za-z])-)?\d+(?:\.\d+)?")
-"""With a sign where it does not join two words, and with a decimal point."""
+"""Numbers with a sign where it does not join two words, and with a decimal point."""
 _CHAIN = re.compile(r"\d+\.\d+\.\d+")
 """Sections, dates or identifiers rather than decimals."""
 _SHOWN = 4

@@ -24,8 +24,11 @@ from torchpcct.validate import choice
 __all__ = ["holds_nexus", "read_nexus"]
 
 _PROJECTION = 0
+"""NXtomo's image key of a projection."""
 _FLAT = 1
+"""Of an image of the open beam."""
 _DARK = 2
+"""Of an image without beam."""
 _DEEPEST = 5
 """Groups between the file and its detector."""
 _SAME_TIME = 1e-3

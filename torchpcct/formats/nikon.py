@@ -38,6 +38,7 @@ _NEEDED = (
     "AngularStep",
     "WhiteLevel",
 )
+"""Entries that an .xtekct file must have."""
 _STRAIGHT_DEG = 1e-3
 """Tilt of the object's axis that does not matter."""
 

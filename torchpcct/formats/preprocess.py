@@ -80,10 +80,11 @@ def cleaned(scan: Scan) -> Scan:
 
 
 _LASTING = (0.4, 0.2, 0.1)
+"""Parts of the views over which stripes are looked for, relative to all."""
 _LEAST_VIEWS = 30
+"""The fewest views of such a part."""
 _BLOCKS = 360
-"""Parts of the views over which stripes are looked for, the fewest views of such a part, and what
-many views are averaged to."""
+"""Averages that many views are reduced to."""
 
 
 @checked

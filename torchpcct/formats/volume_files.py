@@ -59,6 +59,7 @@ series."""
 _ENDING = re.compile(r"\.[A-Za-z][A-Za-z0-9]{0,7}$")
 """What is meant to name a format."""
 _MADE_BY = "torchpcct, "
+"""Beginning of the description in files that are written."""
 _MM = {0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3}
 """Millimetres of NIfTI's units of length: unknown (in practice mm), metre, millimetre,
 micrometre."""

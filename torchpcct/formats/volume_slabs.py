@@ -32,6 +32,7 @@ from torchpcct.validate import UNITS
 __all__ = ["SLAB_ENDINGS", "SlabFile", "check_slab_name", "read_ome_zarr", "write_ome_zarr"]
 
 SLAB_ENDINGS = (".nii", ".zarr")
+"""Endings of files that are written slab by slab."""
 CHUNK = 32
 """Most slices of a Zarr chunk: slabs hold whole chunks, so that none is written twice."""
 _CHUNK_PLANE = 256

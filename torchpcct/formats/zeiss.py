@@ -26,6 +26,7 @@ __all__ = ["read_txrm"]
 _TYPES = {3: "<u1", 5: "<u2", 10: "<f4"}
 """Of images, by the number that the files call ``DataType``."""
 _CONE = 1
+"""``XrayGeometry`` of a cone beam."""
 _A_STORAGE = 100
 """Images of a storage ``ImageData1``, ``ImageData2``, …"""
 _STILL = 1e-3

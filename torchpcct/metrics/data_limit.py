@@ -29,6 +29,7 @@ __all__ = ["ceiling", "information_matrix"]
 Floats = NDArray[np.float64]
 
 _CHUNK = 1 << 20
+"""Readings done together."""
 _WORST_CONDITION = 1e12
 """Of the information scaled to a unit diagonal. Beyond it the inverse has no digits left in
 float64."""

@@ -55,11 +55,13 @@ _CHANCE = 5.0
 _RINGS = 0.15
 """Width of the cells over their frequency."""
 _ORDERS = 3
+"""Highest order of the polynomial in the frequency."""
 _STEPS = 40
+"""Steps of the fit at most."""
 _SETTLED = 1e-5
+"""Change of ln(factor) below which they end."""
 _DAMPED = 0.03
-"""Steps at most; change of ln(factor) below which they end; share of the noise's own curvature
-that shortens them."""
+"""Fraction of the noise's own curvature that shortens them."""
 _FAINT = 0.01
 """Frequencies at which the reference has less of its largest noise power count less: no match
 there is of use."""
@@ -74,6 +76,7 @@ _BORDER = 16
 """Voxels at each border that count less, a third of the axis at most: filters differ in how they
 continue a volume."""
 _ROUGH = "its transfer relative to the reference is no smooth function of the frequency"
+"""Why there is no factor, for messages."""
 _MATCH = 0.01
 """Relative standard error of a factor by the match: of 1.00 for linear filters at most."""
 

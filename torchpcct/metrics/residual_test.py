@@ -40,10 +40,11 @@ CENTRE_TOLERANCE = 0.05
 which voxels and interpolation leave. A reconstruction takes most of an error up: a column off
 leaves the more."""
 _DENSE = 0.8
+"""Quantile of the line integrals from which on rays are dense: the densest fifth."""
 _DENSE_SHARE = 2.0
-"""The densest fifth of the rays, and how many times more they must lie off than the others for
-beam hardening."""
+"""How many times more the dense rays must lie off than the others for beam hardening."""
 _HARMONICS = 3
+"""Harmonics of the turn that are fitted to the views."""
 _LARGE = 1e5
 """Mean from which on the tails of χ² are those of a transformed normal."""
 

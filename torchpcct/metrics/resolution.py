@@ -29,9 +29,11 @@ __all__ = [
 Floats = NDArray[np.float64]
 
 _SECTORS = 12
+"""Parts of an edge whose scatter gives the standard error."""
 _SEEN = 5.0
+"""Least contrast of an edge, in standard errors."""
 _UNCERTAIN = 0.08
-"""Least contrast of an edge in standard errors, largest standard error of its transfer at f50."""
+"""Largest standard error of its transfer at f50."""
 
 
 @checked

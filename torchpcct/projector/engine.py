@@ -23,7 +23,9 @@ from torchpcct.projector.tables import Tables, VectorTables
 __all__ = ["ENGINES", "Engine"]
 
 _TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-10}
+"""Relative error up to which a device's kernels agree with the CPU's."""
 _CHECKED: dict[tuple[str, torch.dtype], bool] = {}
+"""Whether a device's kernels agree, by device and dtype."""
 
 
 ENGINES: weakref.WeakValueDictionary[int, Engine] = weakref.WeakValueDictionary()

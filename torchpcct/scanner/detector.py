@@ -31,9 +31,11 @@ SILICON_THRESHOLDS_KEV = (5.0, 12.0, 22.0, 32.0, 42.0, 52.0, 62.0, 74.0)
 """Assumed thresholds of the eight energy bins of a deep-silicon detector."""
 
 SILICON_LENGTH_MM = 60.0
+"""Assumed length of silicon along the beam, mm."""
 SILICON_SEGMENTS = 3
+"""Assumed number of depth segments."""
 SILICON_SIGMA_KEV = 1.6
-"""Assumed energy resolution (standard deviation) of a silicon strip with its electronics."""
+"""Assumed energy resolution (standard deviation) of a silicon strip with its electronics, keV."""
 
 SILICON_FILL_FACTOR = 0.96
 """Assumed sensitive share of a cell: tungsten foils of 20 µm between silicon sheets at 0.5 mm
@@ -43,6 +45,7 @@ SEGMENT_DESIGN_KEV = 60.0
 """Assumed energy at which the depth segments share the load equally."""
 
 SCINTILLATOR_DEPTH_MM = 3.0
+"""Assumed thickness of the scintillator along the beam, mm (public CatSim/XCIST default)."""
 SCINTILLATOR_FILL_FACTOR = 0.81
 """Assumed sensitive share of a scintillator cell: 0.9 in either direction (public CatSim/XCIST
 default)."""

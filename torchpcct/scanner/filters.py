@@ -40,6 +40,7 @@ _LARGE_RAD = (
     0.40,
     0.48,
 )
+"""Fan angles of the nodes of the large bowtie, rad."""
 _LARGE_CM = (
     0.2548,
     0.2553,
@@ -58,12 +59,14 @@ _LARGE_CM = (
     3.564,
     3.712,
 )
+"""Path through it at the nodes, cm of aluminium."""
 
 ROI_THICKNESS_MM = 39.0
+"""Published: thickness of the part that blocks, mm."""
 ROI_DIAMETER_MM = 100.0
+"""Published: diameter of the region that is spared, mm."""
 ROI_DISTANCE_MM = 263.0
-"""Published: thickness of the part that blocks, diameter of the region, distance of the filter
-from the isocentre."""
+"""Published: distance of the filter from the isocentre, mm."""
 ROI_RAMP_MM = 15.0
 """Inferred width of the ramp of the region-of-interest bowtie, measured where the bowtie stands. It
 is not published; a gradual slope is, and 52 % less dose in the peripheral bores of a 32 cm phantom.

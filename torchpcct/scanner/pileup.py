@@ -33,9 +33,13 @@ __all__ = ["PileUpMap", "pulse_heights", "recorded_rates"]
 Floats = NDArray[np.float64]
 
 _STEP_KEV = 1.0
+"""Width of the bins of deposited energy, keV."""
 _COLUMN_NODES = 64
+"""Columns at which the map is computed; between them it is interpolated."""
 _THICKNESS_MM = 600.0
+"""Thickest water of the map, mm."""
 _THICKNESS_NODES = 80
+"""Thicknesses at which it is computed."""
 _SAMPLES = 2048
 """Samples of the map along the line integral."""
 

@@ -30,8 +30,9 @@ __all__ = [
 ]
 
 PCCT_VIEWS = 1968
+"""Published views per turn of the PCCT."""
 EID_VIEWS = 984
-"""Published views per turn."""
+"""Published views per turn of the EID-CT."""
 
 PCCT_PITCH_MM = (0.50, 0.35)
 """Inferred (row, column) pitch at the detector: 40 rows of 0.5 mm cover the 11.3 mm that the

@@ -314,6 +314,7 @@ def calcification(hu: float = 1500.0) -> Material:
 
 
 _CALCIFIED_KEV = 64.0
+"""Energy at which a mixture of matrix and mineral has the CT number that is asked for, keV."""
 
 
 # The plaque tissues carry the *published* element table of Li et al. (rounded to 1e-4); the tests

@@ -32,12 +32,13 @@ projection on an edge is even, and faces parallel to an edge are resolved to one
 _AGREE = 0.001
 """Two lattices whose fractions differ less are taken for converged."""
 _SEGMENTS = 4
+"""Pieces of a line through a voxel whose ends are compared."""
 _HALVINGS = 8
-"""Of a line through a voxel: pieces whose ends are compared, and halvings of those that a face
-cuts (1/1024 voxel)."""
+"""Halvings of those that a face cuts (1/1024 voxel)."""
 _SLAB = 8
+"""Slices done together."""
 _POINTS = 1 << 19
-"""Slices done together; points asked for at a time."""
+"""Points asked for at a time."""
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -40,6 +40,7 @@ BODY_TISSUES = (
 )
 """The line of the body's tissues by CT number (ICRU Report 44; Woodard and White 1986)."""
 _SOFT = BODY_TISSUES[:4]
+"""Tissues of a voxel up to muscle, from thin to dense."""
 
 DENSE = ("bone", "iodine", "water")
 """What a voxel above muscle can be, in the order of a label volume's 0, 1, 2."""

@@ -43,8 +43,9 @@ EXACT_TOLERANCE = 1e-7
 """The same for noise-free counts, where standard deviations are no measure."""
 
 NAMED = 0.01
+"""Fraction of rays that one bin alone counts from which on a warning names them."""
 REFUSED = 0.5
-"""Shares of rays that one bin alone counts from which on they are named, and refused."""
+"""Fraction of such rays from which on the scan is refused."""
 
 STEP_LIMIT = 160
 """Most rays take three steps; a few in a million, with a handful of counts, need their steps

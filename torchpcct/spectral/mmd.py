@@ -36,6 +36,7 @@ MMD_TISSUES = ("blood_iodine", "necrotic_core", "fibrous_tissue", "pericoronary_
 """The tissues of Li et al."""
 
 _SLACK = 1e-9  # round-off: a voxel on an edge is inside
+"""Round-off: a voxel on an edge is inside."""
 _ITERATIONS = 50
 """Most of Lloyd's algorithm, which usually ends after a few."""
 

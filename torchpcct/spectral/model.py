@@ -34,16 +34,22 @@ START_MATERIAL = "water"
 """The iteration starts at the path of this material that explains the summed counts."""
 
 START_MAX_MM = 600.0
+"""Thickest start material of the first estimate, mm."""
 COARSE_PATH_MM = 80.0
-"""Grouped energies are exact behind this much of the start material and nearly so elsewhere."""
+"""Path through the start material, mm, behind which grouped energies are exact; elsewhere they are
+nearly so."""
 
 COARSE_GROUPS = 16
+"""Groups of energies of the coarse model."""
 _NODES = 64
+"""Nodes of the table of the first estimate."""
 _LOWEST = -4.0
+"""Lower bound of the estimates, as line integrals at 60 keV."""
 _HIGHEST = 16.0
-"""Bounds of the estimates, as line integrals at 60 keV."""
+"""Upper bound."""
 
 _NEGLIGIBLE = 1e-12
+"""Energies with a smaller fraction of the signal are left out."""
 ONE_BIN = (100.0, 5.0)
 """Where one bin counts this much or more, and all others together less than the second number, a
 ray says nothing of two materials: its estimate hangs on single photons."""

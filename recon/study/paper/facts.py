@@ -39,9 +39,12 @@ FULL_VIEWS = {"PCCT": presets.PCCT_VIEWS, "EID-CT": presets.EID_VIEWS}
 thinned out."""
 
 ROTATION_S = 0.35
+"""One rotation, s."""
 
 KERNELS = ("soft", "standard", "detail", "bone")
+"""Kernels of FBP."""
 VOXELS_MM = (0.20, 0.25, 0.30, 0.35, 0.40)
+"""Voxel sizes, mm."""
 DOSES = {"1x": ROTATION_S, "2x": 0.70, "5.7x": 2.00, "8x": 2.80}
 """Exposure (one rotation) in s of each dose level, at 1000 mA."""
 
@@ -50,6 +53,7 @@ TABLE_EXPOSURE_S = 2.00
 of its standard deviations point to the assumed 5.7× dose (an inference of ours)."""
 
 REALIZATIONS = 10
+"""Noise realisations of each setting."""
 
 
 NOISE_FREE_ROI_HU = {"foreground": 40.1, "background": 91.8}
@@ -64,6 +68,7 @@ FOREGROUND = np.array(
         [[51.26, 17.56], [44.38, 12.05], [47.48, 22.38], [48.14, 14.61], [50.35, 20.36]],
     ]
 )
+"""Table of the core: mean and standard deviation, HU, by dose, kernel and voxel size."""
 BACKGROUND = np.array(
     [
         [[88.38, 27.37], [86.44, 16.91], [84.07, 24.28], [83.48, 21.43], [82.12, 17.30]],
@@ -72,6 +77,7 @@ BACKGROUND = np.array(
         [[111.06, 47.88], [99.80, 39.66], [91.62, 52.88], [104.60, 32.34], [91.97, 17.85]],
     ]
 )
+"""The same of fibrous tissue."""
 CNR = np.array(
     [
         [1.33, 2.20, 1.30, 1.44, 1.51],
@@ -80,6 +86,7 @@ CNR = np.array(
         [1.17, 1.34, 0.77, 1.59, 1.54],
     ]
 )
+"""Table of the contrast-to-noise ratio, in the same order."""
 
 SPECTRAL = {
     "optimum_kev": 52.0,

@@ -52,8 +52,9 @@ INSET_MM = (11.3, 9.0, 9.0)
 """Extent (z, y, x) of the reconstructed inset: the paper's 113 × 90 × 90 voxels of 0.1 mm."""
 
 REFERENCE_VOXEL_MM = 0.10
+"""Voxel of the noise-free image that the ROIs are checked on, mm."""
 REFERENCE_KERNEL = "standard"
-"""Of the noise-free image that the ROIs are checked on."""
+"""Kernel of FBP of that image."""
 
 SCANNERS: dict[str, Callable[..., Scanner]] = {"PCCT": presets.pcct, "EID-CT": presets.eid}
 """The paper's two scanners: name → preset, called with the number of views."""
@@ -159,13 +160,17 @@ def enclosing(grids: list[VolumeGrid]) -> VolumeGrid:
 
 
 _ROWS = 12
+"""Detector rows about the middle: more do not change what the middle slices read."""
 _ROD_VIEWS = 60
-"""Detector rows about the middle and views per turn: more do not change what the middle slices
-read."""
+"""Views per turn, likewise."""
 _ROD_MM = 4.0
+"""Diameter of the rod, mm."""
 _LENGTH_MM = 8.0
+"""Its length, mm."""
 _READ_SLICES = 3
+"""Slices that are read."""
 _ROD_VOXEL_MM = 0.25
+"""Voxel size, mm."""
 _MARGIN_MM = 1.0
 """What is read keeps this far from the rod's edge: beyond the reach of every kernel's blur."""
 

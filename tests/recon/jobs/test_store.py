@@ -18,7 +18,7 @@ from tiny_studies import run_tiny
 import recon.jobs.store as store_module
 from recon.jobs import execute
 from recon.jobs.store import Pieces, Store, packed, unpacked
-from recon.study.noise import Table
+from recon.study.noise import RoiStatistics
 from recon.study.results import differences
 from torchpcct import ConeBeam, VolumeGrid, full_turn
 from torchpcct.scan import Scan
@@ -40,7 +40,10 @@ def test_values_come_back_as_they_were(tmp_path):
         ("fbp", 0.25): (np.arange(6).reshape(2, 3), [True, None, 1.5, "α"]),
         0.35: np.float64(2.0),
         "nested": {"tensor": torch.arange(4.0), "empty": ()},
-        "of this software": [Table(np.ones((2, 2)), np.zeros((2, 2))), VolumeGrid((2, 3, 4), 0.5)],
+        "of this software": [
+            RoiStatistics(np.ones((2, 2)), np.zeros((2, 2))),
+            VolumeGrid((2, 3, 4), 0.5),
+        ],
     }
     back = _through_disk(value, tmp_path)
     assert list(back) == list(value)
@@ -51,7 +54,7 @@ def test_values_come_back_as_they_were(tmp_path):
     assert torch.equal(back["nested"]["tensor"], torch.arange(4.0))
     assert back["nested"]["empty"] == ()
     table, grid = back["of this software"]
-    assert isinstance(table, Table)
+    assert isinstance(table, RoiStatistics)
     np.testing.assert_array_equal(table.mean, np.ones((2, 2)))
     assert grid == VolumeGrid((2, 3, 4), 0.5)
 

@@ -34,9 +34,10 @@ NEAREST = 1e-6
 _MOST_PARTS = 256
 """Of a cell, along either step."""
 _SLOPE = 0.2
+"""A rectangle along the axes will do where the footprint's mixed second moment is below this
+fraction of the geometric mean of the other two."""
 _SMALL = 0.1
-"""A rectangle along the axes will do where the footprint's mixed second moment is below so much of
-the geometric mean of the other two, or below so much of a voxel's."""
+"""Or below this fraction of a voxel's."""
 _POINT = 1e-9
 """A rectangle narrower than this part of a voxel is a point."""
 _small = njit(**INNER)

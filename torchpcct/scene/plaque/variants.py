@@ -23,10 +23,11 @@ from torchpcct.validate import checked, choice, whole
 __all__ = ["VARIANTS", "calcification_bodies", "plaque_variant", "stent_bodies", "textured"]
 
 _STRUT_MM = 0.08
+"""Radial thickness and height of a stent's ring, mm, common for cobalt chromium."""
 _RINGS_APART_MM = 1.5
+"""From one ring to the next along the vessel, mm."""
 _CLEARANCE_MM = 0.01
-"""Radial thickness and height of a stent's ring, common for cobalt chromium; from one ring to the
-next along the vessel; and between ring and lumen wall."""
+"""Between ring and lumen wall, mm."""
 
 
 @checked
