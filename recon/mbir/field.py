@@ -346,12 +346,13 @@ def _term(
 ) -> Quadratic:
     """The data term of what is to be added to the edges, for volumes that are divided by s."""
     A = problem.projector
-    rest = [y - A(x) for (y, _), x in zip(slices, around, strict=True)]
-    weighed = [w * v for (_, w), v in zip(slices, rest, strict=True)]
-    energy = torch.stack(
-        [(w * v).sum(dtype=torch.float64) for w, v in zip(weighed, rest, strict=True)]
-    ).sum()
-    b = gram.ratio * _stacked(problem, [A.T(v) for v in weighed])
+    energies, parts = [], []
+    for (y, w), x in zip(slices, around, strict=True):  # the readings of one slice at a time
+        rest = y - A(x)
+        weighed = w * rest
+        energies.append((weighed * rest).sum(dtype=torch.float64))
+        parts.append(A.T(weighed))
+    b = gram.ratio * _stacked(problem, parts)
     readings = sum(int((w > 0).sum()) for _, w in slices)
     return Quadratic(
         gram,
@@ -359,7 +360,7 @@ def _term(
         torch.ones(1),
         (voxel_mm,) * 3,
         problem.mu_ref,
-        energy=energy[None],
+        energy=torch.stack(energies).sum()[None],
         readings=readings,
     )
 
