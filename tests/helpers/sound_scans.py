@@ -585,7 +585,14 @@ def draw(seed: int, *, kind: str | None = None, readings: int = 600_000) -> Draw
         water *= wanted / densest
     # Thin bodies take many rays: those that miss them between two others would be another object's.
     thin = min((s.radii[2] for s in solids if s.value), default=math.inf)
-    across = 1 if kind != "cone" else int(np.clip(math.ceil(4 * row_pitch / zoom / thin), 2, 16))
+    # Where a flat ball ends, the chords of two rays of a row begin so many columns apart.
+    flat = max(
+        (max(s.radii[:2]) / s.radii[2] for s in solids if s.value and s.shape == BALL), default=0.0
+    )
+    across = 1
+    if kind == "cone":
+        rays = max(4 * row_pitch / zoom / thin, flat * row_pitch / pitch)
+        across = int(np.clip(math.ceil(rays), 2, 16))
     options: dict[str, Any] = {"subs": (3, across, 1)}
     step = abs(float(angles[1] - angles[0]))
     if rng.random() < 0.3:

@@ -29,7 +29,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpcct.checks.orbit_plane import lack_of_cells, orbit_plane
+from torchpcct.checks.orbit_plane import THIN, lack_of_cells, orbit_plane
 from torchpcct.checks.scan_test import UNKNOWN, ScanTest, check_lines
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
 
@@ -50,9 +50,6 @@ part by."""
 _SLOW = 8
 """Harmonics of a turn that a motion is looked for in."""
 _SIGMAS = 4.0
-_THIN = 0.5
-"""Of a view's sum, what ends between the rows that are averaged and the next, from which nothing is
-said of it: of a dense disc thinner than a row the readings tell the shadow, not the attenuation."""
 _LACKING = 0.25
 """Of what cells lack at the ends of the object at most, how much may change with the direction
 besides."""
@@ -91,7 +88,8 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     turned, parted, lacking = 0.0, 0.0, torch.zeros(g.views, g.columns, dtype=torch.float64)
     if isinstance(g, ConeBeam):
         plane = orbit_plane(values, g)
-        if plane is None or plane.part > _THIN:
+        # Of a dense disc thinner than a row the readings tell the shadow, not the attenuation.
+        if plane is None or plane.part > THIN:
             return UNKNOWN
         closed = bool(np.ptp(g.angles) + view_step(g.angles) > 1.9 * math.pi)
         parted = plane.part
@@ -110,7 +108,7 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     scale = float(np.abs(t).max())
     moments = [(p * width * (t / scale) ** k).sum(1) for k in range(3)]
     weight, weight_error = _weight(theta, moments[0])
-    step, step_error = _step(theta, moments[1:])
+    step, step_error, amplified = _step(theta, moments[1:])
     cell = float(np.median(np.abs(width)))
     mass = float(moments[0].mean())
     centre, centre_error = (
@@ -125,7 +123,7 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
         parted *= min(2.0 * edge / g.sod, 1.0)
     findings = []
     lacks = turned + _edges(theta, p, lack, p.sum(1))
-    if _LARGEST_STEP > abs(step) > STEP_TOLERANCE + turned + _SIGMAS * step_error:
+    if _LARGEST_STEP > abs(step) > STEP_TOLERANCE + turned * amplified + _SIGMAS * step_error:
         findings.append(
             "the centre of mass and the width of the views do not turn with them: the steps "
             "between the views are "
@@ -296,11 +294,12 @@ def _axial(lines: Tensor, g: ConeBeam) -> tuple[float, float, float]:
     return size, error, AXIAL_ROWS * g.pitch[0] / zoom + parted
 
 
-def _step(theta: Floats, moments: list[Floats]) -> tuple[float, float]:
+def _step(theta: Floats, moments: list[Floats]) -> tuple[float, float, float]:
     """Gauss and Newton's estimate of s in the frequencies 1 + s and 2 (1 + s), of both moments
-    together."""
+    together; its error; and what a relative change of the moments by 1 (root mean square), as a
+    wave of one turn, would look like, at least 1."""
     if theta.size * view_step(theta) > 1.9 * math.pi:
-        return math.nan, math.inf  # opposite rays tell it better
+        return math.nan, math.inf, 1.0  # opposite rays tell it better
     parts = []
     for order, y in enumerate(moments, start=1):
         orders = (1, 2)[:order]
@@ -313,11 +312,17 @@ def _step(theta: Floats, moments: list[Floats]) -> tuple[float, float]:
                 k * (found[2 * i + 2] * np.cos(k * turned) - found[2 * i + 1] * np.sin(k * turned))
                 for i, k in enumerate(orders)
             )
-            values, errors = _fit(np.column_stack([design, turning * (theta - theta.mean())]), y)
+            pattern = turning * (theta - theta.mean())
+            values, errors = _fit(np.column_stack([design, pattern]), y)
             s += float(np.clip(values[-1], -0.1, 0.1))
-        parts.append((s, max(float(errors[-1]), 1e-9)))
-    weights = np.array([1.0 / e**2 for _, e in parts])
-    mean = float((weights * [s for s, _ in parts]).sum() / weights.sum())
+        own = pattern - design @ np.linalg.lstsq(design, pattern, rcond=None)[0]
+        waves = [float(own @ (y * wave(theta))) for wave in (np.cos, np.sin)]
+        stray = math.sqrt(2.0) * math.hypot(*waves) / max(float(own @ own), 1e-300)
+        parts.append((s, max(float(errors[-1]), 1e-9), stray))
+    weights = np.array([1.0 / e**2 for _, e, _ in parts])
+    mean, amplified = (
+        float((weights * [part[k] for part in parts]).sum() / weights.sum()) for k in (0, 2)
+    )
     # Two moments that contradict each other say less than either.
     apart = abs(parts[0][0] - parts[1][0]) if weights.min() > 0.05 * weights.max() else 0.0
-    return mean, math.hypot(weights.sum() ** -0.5, apart / 2)
+    return mean, math.hypot(weights.sum() ** -0.5, apart / 2), max(amplified, 1.0)

@@ -56,6 +56,9 @@ JUMP_CELLS = 0.5
 finding."""
 ALTERNATION = 0.25
 """Shift between views (or columns) that alternate, in cells at the axis, that is no finding."""
+_LEAST_JUMP = 0.75
+"""Of a pair's own step, by which it must be longer or shorter to be of views that are missing,
+stuck or exchanged, which a whole step makes; less is of an edge that the rays pass along."""
 _SIGMAS = 8.0
 _JUMP_SIGMAS = 10.0
 _GOES_ON = 0.25
@@ -324,6 +327,7 @@ class _Views:
         # along need not.
         padded = np.pad(shift, 2)
         onward = np.max([padded[k : k + pairs] for k in (0, 1, 3, 4)], axis=0)
+        along_it &= np.abs(shift) > _LEAST_JUMP
         along_it &= (shift > 0.0) | (onward > _GOES_ON * np.abs(shift))
         # Pair k is of the views k + 2 and k + 3 of the longer sequence.
         first = (np.arange(pairs) + 2 - (_REACH if self.closes else 0)) % n

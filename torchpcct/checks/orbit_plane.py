@@ -26,7 +26,7 @@ from torch import Tensor
 
 from torchpcct.geometry import ConeBeam
 
-__all__ = ["PARTED", "OrbitPlane", "lack_of_cells", "orbit_plane", "shared_square"]
+__all__ = ["PARTED", "THIN", "OrbitPlane", "lack_of_cells", "orbit_plane", "shared_square"]
 
 _FLAT_CELLS = 1.0
 """Rows whose opposite rays part by more than so many of them at the border of the field are not
@@ -35,6 +35,9 @@ PARTED = 2.5
 """Times the mean square of what opposite rays part by, as it is here estimated, that they may
 differ: 2.1 times at most of 150 sound scans drawn at random (bodies beside the axis, parts of a
 turn, opaque ones)."""
+THIN = 0.5
+"""Of a view's sum, what ends between the rows that are averaged and the next, from which on the
+object may be thinner than a row: how it changes within one is not known then."""
 _NEEDED = 16.0
 """Square of the standard errors of a finding: how many variances of noise weigh as much as what
 rays part by."""
@@ -83,7 +86,7 @@ def orbit_plane(lines: Tensor, geometry: ConeBeam) -> OrbitPlane | None:
         lines: line integrals ``(views, rows, columns)``.
         geometry: of the scan.
     """
-    levels = _levels(geometry)
+    levels, onward = _levels(geometry)
     if not levels:
         return None
     heights, row = np.array(levels), geometry.pitch[0]
@@ -101,10 +104,10 @@ def orbit_plane(lines: Tensor, geometry: ConeBeam) -> OrbitPlane | None:
             break
         total, rows = total + float(counts[k]) * level, rows + int(counts[k])
         mean = total / rows
-        border, guarded = _border(lines, geometry, heights[k] + row)
+        border, guarded = _border(lines, geometry, heights[k] + onward)
         beside = [
             _row(lines, geometry, side * v)
-            for v in (heights[k] - row, heights[k] + row)
+            for v in (heights[k] - onward, heights[k] + onward)
             for side in (-1, 1)
         ]
         ends = [level] if border is None else [beside[2] - beside[0], beside[3] - beside[1]]
@@ -123,6 +126,14 @@ def orbit_plane(lines: Tensor, geometry: ConeBeam) -> OrbitPlane | None:
             )
         away = _spread(change, off_axis) if square > 0 else 0.0
         parted = PARTED * 4.0 * square * away / geometry.sod**2
+        sums, all_of_it = change.mean(1), float(mean.mean())
+        # Of a body thinner than a row every row steps, and the means may be alike.
+        ends_within = max(float(sums.abs().mean()), stepping / rows)
+        share = ends_within / all_of_it if all_of_it > 0 else 1.0
+        if share > THIN:
+            crossing = shared_square(_crossing(lines, geometry, float(heights[k]), onward))
+            crossing /= rows**2
+            parted = max(parted, crossing)
         if noise is None:
             # Of one row: the border is the mean of two, the first level of one or two.
             noise = max(float(change.double().square().mean()) - shared_square(change), 0.0) / (
@@ -130,10 +141,6 @@ def orbit_plane(lines: Tensor, geometry: ConeBeam) -> OrbitPlane | None:
             )
         cost = _NEEDED * 2.0 * noise / rows + parted * mean.numel() / 2
         if best is None or cost < best[0]:
-            sums, all_of_it = change.mean(1), float(mean.mean())
-            # Of a body thinner than a row every row steps, and the means may be alike.
-            ends_within = max(float(sums.abs().mean()), stepping / rows)
-            share = ends_within / all_of_it if all_of_it > 0 else 1.0
             far = math.sqrt(_spread(mean, off_axis)) / geometry.sod
             best = (
                 cost,
@@ -142,17 +149,19 @@ def orbit_plane(lines: Tensor, geometry: ConeBeam) -> OrbitPlane | None:
     return None if best is None else best[1]
 
 
-def _levels(geometry: ConeBeam) -> list[float]:
-    """Heights v ≥ 0 in steps of a row at which the detector has something to say of v and −v."""
+def _levels(geometry: ConeBeam) -> tuple[list[float], float]:
+    """Heights v ≥ 0 in steps of a row at which the detector has something to say of v and −v; and
+    how far from the last of them what lies beside is read."""
     row = geometry.pitch[0]
     low, high = geometry.row_positions[0], geometry.row_positions[-1]
     ends = min(-low, high) + 1e-6 * row
     odd = abs((low / row) % 1.0 - 0.5) < 0.25
     first = 0.5 * row if odd else 0.0
     if ends < first:
-        # A plane in the outer half of the outermost row, or nowhere.
-        return [0.0] if min(-low, high) >= -0.5 * row * (1 + 1e-9) else []
-    return list(np.arange(first, ends, row))
+        # A plane in the outer half of the outermost row, read from it and the next, or nowhere.
+        inside = min(-low, high) >= -0.5 * row * (1 + 1e-9)
+        return [0.0] if inside else [], 1.5 * row
+    return list(np.arange(first, ends, row)), row
 
 
 def _border(lines: Tensor, geometry: ConeBeam, height: float) -> tuple[Tensor | None, bool]:
@@ -166,6 +175,29 @@ def _border(lines: Tensor, geometry: ConeBeam, height: float) -> tuple[Tensor | 
         if end >= reach
     ]
     return (sum(sides[1:], sides[0]) / len(sides) if sides else None), len(sides) == 2
+
+
+def _crossing(lines: Tensor, geometry: ConeBeam, height: float, onward: float) -> Tensor:
+    """What may leave the rows up to a height for those beside them on the way to the opposite ray,
+    or come from there, ``(views, columns)``.
+
+    A body thinner than a row that lies at their border is in one of them from this side, in the
+    other from that side: no more of it than the lesser of the two reads, and nothing where they and
+    the row beyond read the same.
+    """
+    tolerance, row = 1e-6 * geometry.pitch[0], geometry.pitch[0]
+    low, high = geometry.row_positions[0], geometry.row_positions[-1]
+    total = torch.zeros_like(lines[:, 0])
+    for side, end in ((-1, -low), (1, high)):
+        if end < height + onward - row / 2 - tolerance:
+            continue
+        heights = (height, height + onward, height + onward + row)
+        inside, beside, beyond = (_row(lines, geometry, side * v) for v in heights)
+        if end < heights[2] - row / 2 - tolerance:  # nobody knows what is there
+            beyond = torch.zeros_like(beside)
+        step = torch.maximum((inside - beside).abs(), (beside - beyond).abs())
+        total += torch.minimum(torch.minimum(inside, beside).clamp_min(0.0), step)
+    return total
 
 
 def _row(lines: Tensor, geometry: ConeBeam, height: float) -> Tensor:
