@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from recon.analytic.angular_weights import angular_weights
+from recon.analytic.angular_weights import INNER_GAP_RAD, angular_weights
 from recon.analytic.any_orbit import rebin_to_circle
 from recon.analytic.detector_edges import cut_off, reach
-from torchpcct.angles import SAME_VIEW, is_offset
+from torchpcct.angles import OPEN_GAP_STEPS, SAME_VIEW, is_offset
 from torchpcct.checks.defects import BRIGHT
 from torchpcct.detector_window import footprint
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid, beam, view_step
@@ -52,6 +52,9 @@ show, too; attenuation of water in mm⁻¹ of photons (18 keV) that pass no pati
 which nothing passes; and share of it that a unit's factor of ten leaves."""
 _BORDER = 2
 """Columns at either border of a window that are compared with the surround."""
+_RIM = 0.05
+"""Share of the mean line integral of the densest column from which a column passes through the
+object."""
 _STEADY = 0.98
 _TRAVEL = 0.25
 """A motion along z that a straight line explains to this share of its variance, by more than this
@@ -202,8 +205,9 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
     Neighbouring views (:mod:`torchpcct.checks.neighbours`: order, missing, stuck, travel) and
     columns (:mod:`torchpcct.checks.columns`: gains, places); opposite rays
     (:mod:`torchpcct.checks.opposite_rays`); where they agree, the moments of the views
-    (:mod:`torchpcct.checks.moments`: no line integrals, motion) of a whole field; rows that end
-    inside the object; and of a window whether its borders see the surround, and its cells have one
+    (:mod:`torchpcct.checks.moments`: no line integrals, motion) of a whole field; lines through the
+    object that no view measured; rows that end inside the object; and of a window whether its
+    borders see the surround, and its cells have one
     gain.
 
     Args:
@@ -252,15 +256,52 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
         weights = angular_weights(geometry)
     except ValueError:  # FBP refuses these views, other methods need not
         weights = np.ones((geometry.views, 1))
-    found += columns
+    unmeasured = _unmeasured_texts(lines, geometry, grid)
+    found += [*columns, *unmeasured]
     sides = cut_off(lines, geometry, weights)
     if any(sides):
         found.append(_cut_text(lines, sides))
-    elif len(found) == len(columns) and not is_offset(geometry):
+    elif len(found) == len(columns) + len(unmeasured) and not is_offset(geometry):
         found += moment_test(lines, geometry).findings
     if scan.unit == "HU":
         found += _water_texts(lines, geometry, scan.linearisation.mu_ref)
     return found
+
+
+def _unmeasured_texts(lines: Any, geometry: Any, grid: VolumeGrid) -> list[str]:
+    """Lines through the object and the grid that no view measured, of a cone beam in the plane of
+    the source: FBP refuses an arc below half a turn and the detector's fan, an iterative method
+    takes it, and needs half a turn and the object's.
+
+    A line is given by its direction and its distance t from the axis. The column at t measures the
+    directions of the views less its fan angle, that at -t the same lines from their other ends.
+    """
+    mean = lines.reshape(geometry.views, -1, geometry.columns).double().mean((0, 1)).numpy()
+    t = reach(geometry)
+    seen = np.abs(t) <= math.hypot(*grid.center[-2:]) + math.hypot(*grid.extent[-2:]) / 2
+    seen &= mean > _RIM * mean.max(initial=0.0)
+    columns = np.flatnonzero(seen)
+    if not columns.size:
+        return []
+    fan = np.zeros_like(t) if isinstance(geometry, ParallelBeam) else geometry.fan_angles
+    lacking = np.zeros(columns.size)
+    for k, column in enumerate(columns):
+        directions = [geometry.angles - fan[column]]
+        if t.min() <= -t[column] <= t.max():
+            directions.append(geometry.angles + fan[column] + math.pi)
+        ordered = np.sort(np.concatenate(directions) % (2.0 * math.pi))
+        lacking[k] = max(np.diff(ordered).max(initial=0.0), ordered[0] + 2 * math.pi - ordered[-1])
+    usual = view_step(geometry.angles)
+    lacking -= usual
+    worst = int(np.argmax(lacking))
+    if lacking[worst] <= max(INNER_GAP_RAD, OPEN_GAP_STEPS * usual):
+        return []
+    return [
+        f"no view measured the lines at {abs(t[columns[worst]]):.3g} mm from the axis, which pass "
+        f"through the object, in {math.degrees(lacking[worst]):.2g}° of their directions: edges "
+        "along them are smeared, and values beside them wrong by tens of HU; add views until they "
+        "cover half a turn and the fan of the object"
+    ]
 
 
 def _water_texts(lines: Any, geometry: Any, mu_water: float) -> list[str]:

@@ -89,6 +89,45 @@ def test_views_that_lack_inside_of_the_scan_are_refused_or_named(caplog):
     assert caplog.text == ""
 
 
+@pytest.mark.parametrize(
+    ("kind", "radius", "degrees", "lacking"),
+    [
+        ("fan", 110.0, (0, 360), None),
+        ("fan", 110.0, (0, 213), None),  # half a turn and the fan of the object
+        ("fan", 110.0, (0, 180), 24),  # 2 asin(110 / 500) less what a rim of 5 % leaves
+        ("fan", 40.0, (0, 190), None),  # this one's fan is 9°
+        ("parallel", 110.0, (0, 180), None),
+        ("parallel", 110.0, (0, 160), 20),
+    ],
+)
+def test_lines_that_no_view_measured_are_named(kind, radius, degrees, lacking):
+    """A fan over half a turn: PWLS and MBIR were 60 HU off without a word."""
+    angles = np.deg2rad(np.arange(*degrees, 2.0))
+    g = FanBeam(angles, 500.0, 900.0, 256, 1.8) if kind == "fan" else ParallelBeam(angles, 256, 1.0)
+    lines = line_integrals(g, [Ellipsoid((0.0, 0.0), (radius, radius), value=0.02)], sub=1)
+    scan = Scan.from_line_integrals(lines.astype(np.float32), g, mu_water=0.02)
+    found = [
+        t for t in consistency_warnings(scan, VolumeGrid((50, 50), 5.0)) if "no view measured" in t
+    ]
+    assert len(found) == (lacking is not None), found
+    if lacking is not None:
+        assert float(found[0].split(" in ")[1].split("°")[0]) == pytest.approx(lacking, abs=2.0)
+
+
+def test_a_gap_that_opposite_views_fill_is_none():
+    def told(views):
+        g = FanBeam(np.deg2rad(views), 500.0, 900.0, 256, 1.8)
+        lines = line_integrals(g, [Ellipsoid((0.0, 0.0), (110.0, 90.0), value=0.02)], sub=1)
+        scan = Scan.from_line_integrals(lines.astype(np.float32), g, mu_water=0.02)
+        return any(
+            "no view measured" in t for t in consistency_warnings(scan, VolumeGrid((50, 50), 5.0))
+        )
+
+    turn = np.arange(0, 360, 2.0)
+    assert not told(turn[(turn < 100) | (turn >= 140)])
+    assert told(turn[(turn < 100) | ((turn >= 140) & (turn < 220))])
+
+
 def test_few_views_are_named(clean):
     assert "120 views are few" in sampling_warnings(clean.geometry)[0]
     assert sampling_warnings(clean.geometry.select(slice(None))) == sampling_warnings(
