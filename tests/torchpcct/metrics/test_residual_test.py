@@ -100,6 +100,29 @@ def test_a_wrong_noise_level_is_found():
     )
 
 
+def test_what_voxels_leave_at_edges_is_no_error_of_the_scan():
+    """Sound scans were told that "exposure, geometry or surround are not those of the scan"."""
+    step = torch.zeros(SHAPE, dtype=torch.float64)
+    step[..., 8:16] = 0.1
+    edge = torch.zeros(SHAPE, dtype=torch.float64)
+    edge[..., [7, 15]] = 1.0  # at which the fitted ones lie a fifth of the step off, to either side
+    edge[..., [8, 16]] = -1.0
+    for clear, told in ((1.0, False), (100.0, True)):
+        found = residual_test(noise(5) / clear**0.5 + 0.02 * edge, clear * W, step)
+        assert found.chi2 > 1.05
+        assert any("at edges" in text for text in found.findings) == told
+        assert not any("exposure" in text for text in found.findings)
+    # All readings too noisy, those at edges or not.
+    found = residual_test(0.15 * noise(5), 100 * W, step)
+    assert "exposure" in found.findings[0]
+
+
+def test_gains_that_air_leaves_are_no_wrong_noise():
+    cells = 0.001 * torch.randn(SHAPE[1:], generator=torch.Generator().manual_seed(3)).double()
+    assert residual_test(noise(6) / 20 + cells, 400 * W, LINES).findings == ()
+    assert residual_test(noise(6) / 20 + 10 * cells, 400 * W, LINES).findings != ()
+
+
 def test_readings_without_weight_do_not_count():
     weights, residual = W.clone(), noise(4)
     weights[::7, 2] = 0
