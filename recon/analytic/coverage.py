@@ -283,7 +283,7 @@ def _unmeasured_texts(lines: Any, geometry: Any, grid: VolumeGrid) -> list[str]:
     columns = np.flatnonzero(seen)
     if not columns.size:
         return []
-    fan = np.zeros_like(t) if isinstance(geometry, ParallelBeam) else geometry.fan_angles
+    fan = np.zeros_like(t) if geometry.parallel else geometry.fan_angles
     lacking = np.zeros(columns.size)
     for k, column in enumerate(columns):
         directions = [geometry.angles - fan[column]]

@@ -292,6 +292,8 @@ class _Views:
         change = [np.diff(x, axis=0) for x in sets]
         scatter = 0.5 * np.square(np.diff(change[0] - change[1], axis=0)).mean(0)
         scatter = scatter + 0.1 * scatter.mean() + 1e-9 * np.square(change[0]).mean()
+        # Nothing changes at all in a round body without noise.
+        scatter = np.maximum(scatter, np.finfo(np.float64).tiny)
         change = [c / np.sqrt(scatter) for c in change]
         rate = [c / a[:, None] for c in change]
         # The rate at the pair from two pairs before and two behind it: exact for a cubic function
