@@ -355,21 +355,23 @@ def _require_scanner(scan: Any, scanner: Scanner) -> None:
     """Refuse weights of another scanner than the scan's: its readings in air tell."""
     _require_bins(scanner)
     _, spectra = scanner.weights()
-    air = np.einsum("bce,r->brc", spectra, scanner.row_factor)
-    if air.shape == tuple(scan.air.shape):
+    air = spectra.sum(-1)
+    found = scan.air.double().numpy()
+    if air.shape == (found.shape[0], found.shape[-1]):
         if (pile_up := scanner.pile_up()) is not None:
             true = torch.from_numpy(air)
             air = pile_up.apply(true, true, np.arange(air.shape[-1])).numpy()
-        # the exposure, and the current, are free
-        ratio = scan.air.double().numpy() / np.maximum(air, np.finfo(float).tiny)
-        difference = float(np.abs(ratio / np.median(ratio) - 1.0).max())
+        # The exposure is free, and which rows were read: each may have a level of its own.
+        ratio = found / np.maximum(air, np.finfo(float).tiny)[:, None]
+        level = np.median(ratio, axis=(0, 2), keepdims=True)
+        difference = float(np.abs(ratio / level - 1.0).max())
     else:
         difference = np.inf
     if not difference < _SAME_AIR:
         said = (
             f"{100 * difference:.3g} %"
             if np.isfinite(difference)
-            else f"{tuple(scan.air.shape)} and {air.shape} (bins, rows, columns)"
+            else f"{(found.shape[0], found.shape[-1])} and {air.shape} (bins, columns)"
         )
         raise ValueError(
             f"the weights are of another scanner than the scan (readings in air differ: {said}): "

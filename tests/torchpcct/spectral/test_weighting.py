@@ -203,6 +203,23 @@ def test_files_keep_weighted_scans(tmp_path, clean, iodine):
     }
 
 
+def test_parts_of_a_scan_are_those_of_its_scanner(tmp_path, clean, iodine):
+    """Some views, some rows of a file, less dose: the weights of the whole scanner fit them all."""
+    whole = clean.weighted(iodine)
+    clean.with_noise(1.0, 0).save(tmp_path / "scan.h5")
+    rows = replace(
+        clean,
+        counts=clean.counts[:, :, 2:4],
+        air=clean.air[:, 2:4],
+        geometry=clean.geometry.with_rows(2, 2),
+    )
+    torch.testing.assert_close(rows.weighted(iodine).counts, whole.counts[:, 2:4])
+    some = clean.select(slice(0, 40, 4)).weighted(iodine)
+    torch.testing.assert_close(some.line_integrals(), whole.line_integrals()[::4])
+    quarter = Scan.load(tmp_path / "scan.h5").at_dose(0.25).weighted(iodine)
+    assert float(quarter.counts.mean() / whole.counts.mean()) == pytest.approx(0.25, rel=0.02)
+
+
 def test_dead_readings_are_those_of_bins_that_weigh(clean, iodine):
     dead = torch.zeros(clean.counts.shape, dtype=torch.bool)
     dead[3, :, 2, 7] = dead[0, 5, 1, 1] = True
