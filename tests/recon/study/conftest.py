@@ -2,7 +2,7 @@
 
 A session's fixture is one for each process, and ``--dist worksteal`` gives a process tests that
 stand together. So a study is measured once or, where a file is shared, twice a session, if only its
-own test file asks for it.
+own test file asks for it; once with ``--dist loadfile``, which ``.ci/run`` gives the long tests.
 """
 
 import functools
