@@ -291,6 +291,8 @@ def weighted_scan(scan: Any, weights: Any, scanner: Scanner | None = None) -> An
             "these weights do not say of which scanner they are, and its spectra make the water "
             "correction: give scanner=, or weights of bin_weights"
         )
+    if not isinstance(scanner, Scanner):
+        raise TypeError(f"scanner must be a Scanner, got {type(scanner).__name__}")
     _require_scanner(scan, scanner)
     silent = [k for k in range(bins) if values[k].any() and not float(scan.counts[k].amax()) > 0]
     if silent:
