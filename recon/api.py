@@ -23,6 +23,7 @@ from torchpcct.checks.readings import reading_warnings
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.scan_grid import finite_cells
+from torchpcct.scan_memory import once
 from torchpcct.validate import checked
 from torchpcct.volume import Volume, from_hu
 
@@ -202,7 +203,7 @@ def reconstruct(
             )
         named["network"] = Mbir.load(named.pop("weights"), network=named.pop("network", None))
     chosen: dict[str, Any] = {**named, **options}
-    whole = [(s, [*texts, *reading_warnings(s)]) for s, texts in map(repair_defects, scans)]
+    whole = [_prepared(s) for s in scans]
     scans = [s for s, _ in whole]
     for text in {text for _, texts in whole for text in texts}:
         _LOG.warning("%s", text)
@@ -230,6 +231,22 @@ def reconstruct(
     return volumes[0] if isinstance(scan, Scan) else volumes
 
 
+def _prepared(scan: Scan) -> tuple[Scan, list[str]]:
+    """A scan with its readings repaired, and what they say against their description; the work of
+    the first method on it."""
+
+    def look() -> tuple[Scan | None, list[str]]:
+        repaired, texts = repair_defects(scan)
+        return None if repaired is scan else repaired, [*texts, *reading_warnings(repaired)]
+
+    repaired, texts = once(scan, "readings", look)
+    return scan if repaired is None else repaired, texts
+
+
+def _consistency(scan: Scan, grid: VolumeGrid) -> list[str]:
+    return once(scan, "consistency", lambda: consistency_warnings(scan, grid), grid)
+
+
 def _finished(
     scan: Scan, grid: VolumeGrid, solution: Result
 ) -> tuple[Tensor, dict[str, Any], list[str]]:
@@ -243,7 +260,7 @@ def _finished(
         }
     failed: list[str] = []
     consistency = tested(
-        "the test of the scan against its description", failed, consistency_warnings, scan, grid
+        "the test of the scan against its description", failed, _consistency, scan, grid
     )
     found = [text for texts in consistency for text in texts]
     found += [*solution.warnings, *(text for t in tests for text in t.findings)]

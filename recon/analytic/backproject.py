@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -35,6 +36,7 @@ _ATAN_TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}
 _FEWEST_ROWS = 8
 
 
+@functools.lru_cache(maxsize=64)
 def _atan_polynomial(reach: float, columns_per_rad: float, dtype: torch.dtype) -> tuple[float, ...]:
     """Coefficients c of ``2 atan(t) ≈ t · c(t²)`` for |t| ≤ reach, highest power first."""
     tolerance = _ATAN_TOLERANCE[dtype] / max(columns_per_rad, 1.0)

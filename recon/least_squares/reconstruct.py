@@ -13,6 +13,7 @@ from recon.least_squares.qggmrf import QGGMRF
 from recon.result import Result
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
+from torchpcct.scan_memory import once
 from torchpcct.volume import in_words
 
 __all__ = ["TOLERANCE_HU", "reconstruct_pwls"]
@@ -67,7 +68,7 @@ def reconstruct_pwls(
         problem = (
             FieldProblem(scans[0], grid)
             if is_whole_field(scans[0], grid)
-            else InsetProblem(scans[0], grid)
+            else once(scans[0], "inset", lambda: InsetProblem(scans[0], grid), grid)
         )
     for i in range(0, len(scans), batch):
         part = scans[i : i + batch]

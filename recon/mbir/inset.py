@@ -16,6 +16,7 @@ from recon.mbir.mbir import Mbir, average_onto, working_grid
 from recon.result import RESIDUAL_TEST, Result, tested
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
+from torchpcct.scan_memory import once
 
 __all__ = ["Inset"]
 
@@ -51,7 +52,9 @@ class Inset:
         _check_cells(scan, network.voxel_mm)
         self.network, self.noise_map = network, noise_map
         self._asked, self._work = grid, working_grid(grid, network.voxel_mm)
-        self.problem = problem or InsetProblem(scan, self._work)
+        self.problem = problem or once(
+            scan, "inset", lambda: InsetProblem(scan, self._work), self._work
+        )
         if self.problem.grid != self._work:
             raise ValueError(
                 f"the problem was made for another grid: make it on {self._work} "

@@ -1,0 +1,347 @@
+"""Operations of torchpcct beside those of peers: one process a toolkit, calls interleaved.
+
+    pip install -e ".[peers]" && python tests/bench/peers.py [--rounds 7] [--small] [--out FOLDER]
+    [--python /other/venv/bin/python] [--toolkits torchpcct ASTRA]
+
+Every toolkit computes in a process of its own, so that none disturbs the threads or the memory of
+another; the processes take turns, one call each, so that all meet the same load of the machine. The
+first call (which compiles, loads and allocates) stands beside the steady state. Errors are relative
+L2 against exact, cell-averaged integrals of the same objects, and of FBP against the pixels of
+smooth ones. A toolkit takes part where it is installed, in the operations that it has.
+"""
+
+import argparse
+import datetime
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+sys.path.insert(0, str(Path(__file__).parent))
+from projectors import Case, _gaussians, _machine, astra_line, ours, xcist
+
+from recon import fbp
+from torchpcct.geometry import ConeBeam, FanBeam, VolumeGrid, full_turn
+from torchpcct.threads import get_num_threads
+
+
+class Toolkit(NamedTuple):
+    """What one toolkit does on one case: operations to time, and what some of them give.
+
+    Attributes:
+        operations: by name, called without arguments.
+        projected: forward projection of an image; None: there is none.
+        reconstructed: FBP of the exact line integrals; None: there is none.
+        every: views 0, every, 2 every, … are taken, the times multiplied.
+    """
+
+    operations: dict[str, Callable[[], Any]]
+    projected: Callable[[np.ndarray], np.ndarray] | None = None
+    reconstructed: Callable[[], np.ndarray] | None = None
+    every: int = 1
+
+
+def bench_cases(small: bool) -> list[Callable[[], Case]]:
+    """A fan and a cone beam, as large as asked for."""
+    n = 128 if small else 512
+    fan = FanBeam(full_turn(984 * n // 512), 626.0, 1098.0, 888 * n // 512, 0.6 * 512 / n)
+    m = 32 if small else 128
+    cone = ConeBeam(full_turn(360 * m // 128), 600.0, 1200.0, 3 * m // 2, 3 * m // 2, 192.0 / m)
+    volume = VolumeGrid((m,) * 3, 128.0 / m)
+    return [
+        lambda: Case(f"fan {n}²", fan, VolumeGrid((n, n), 250 / n)),
+        lambda: Case(f"cone {m}³", cone, volume, bodies=_gaussians(volume)[:3]),
+    ]
+
+
+def of_torchpcct(case: Case) -> Toolkit:
+    """Ours, in float32 on all threads."""
+    mine = ours(case, torch.float32, get_num_threads())
+    lines = torch.as_tensor(case.exact["gaussians"], dtype=torch.float32)
+    assert mine.adjoint is not None
+
+    def reconstruct() -> np.ndarray:
+        return fbp(lines, case.geometry, case.grid, "ram-lak").numpy()
+
+    operations = {"forward": mine.forward, "back": mine.adjoint, "FBP": reconstruct}
+    return Toolkit(operations, mine.check, reconstruct)
+
+
+def of_astra(case: Case) -> Toolkit | None:
+    """ASTRA's line projector on the CPU, and FBP with it."""
+    peer = astra_line(case)
+    if peer is None:
+        return None
+    import astra
+
+    assert peer.adjoint is not None
+    g, grid = case.geometry, case.grid
+    (ny, nx), (cy, cx), (ey, ex) = grid.shape, grid.center, grid.extent
+    volume = astra.create_vol_geom(ny, nx, cx - ex / 2, cx + ex / 2, cy - ey / 2, cy + ey / 2)
+    # FBP takes no vectors: angles from the y axis.
+    projection = astra.create_proj_geom(
+        "fanflat", g.column_pitch, g.columns, g.angles + np.pi / 2, g.sod, g.sdd - g.sod
+    )
+    projector = astra.create_projector("line_fanflat", projection, volume)
+    lines = astra.data2d.create("-sino", projection, case.exact["gaussians"].astype(np.float32))
+    image = astra.data2d.create("-vol", volume)
+    config = astra.astra_dict("FBP")
+    config.update({"ProjectorId": projector, "ProjectionDataId": lines})
+    config["ReconstructionDataId"] = image
+    config["option"] = {"FilterType": "ram-lak"}
+    algorithm = astra.algorithm.create(config)
+
+    def reconstruct() -> np.ndarray:
+        astra.algorithm.run(algorithm)
+        return np.asarray(astra.data2d.get(image))[::-1]
+
+    operations = {"forward": peer.forward, "back": peer.adjoint, "FBP": reconstruct}
+    return Toolkit(operations, peer.check, reconstruct)
+
+
+def of_xcist(case: Case) -> Toolkit | None:
+    """XCIST's distance-driven C projectors."""
+    spec = importlib.util.find_spec("gecatsim")
+    if spec is None or spec.origin is None:
+        return None
+    library = Path(spec.origin).parent / "lib" / "libcatsim.so"
+    peer = xcist(case, str(library)) if library.exists() else None
+    if peer is None:
+        return None
+    operations = {"forward": peer.forward}
+    if peer.adjoint is not None:
+        operations["back"] = peer.adjoint
+    return Toolkit(operations, peer.check, every=peer.every)
+
+
+def of_rtk(case: Case) -> Toolkit | None:
+    """RTK's Joseph projectors and FDK on the CPU."""
+    if importlib.util.find_spec("itk") is None or case.grid.ndim == 2:
+        return None
+    import itk
+
+    try:
+        rtk = itk.RTK
+    except AttributeError:
+        return None
+    g, grid = case.geometry, case.grid
+    turn = rtk.ThreeDCircularProjectionGeometry.New()
+    for angle in np.degrees(g.angles):
+        turn.AddProjection(g.sod, g.sdd, float(angle) + 90.0)
+    kind = itk.Image[itk.F, 3]
+
+    def image(values: np.ndarray, spacing: tuple[float, ...]) -> Any:
+        """``values (z, y, x)`` as RTK has them: its y is our z, centred."""
+        made = itk.image_from_array(np.ascontiguousarray(values, dtype=np.float32))
+        made.SetSpacing([float(s) for s in spacing])
+        size = values.shape[::-1]
+        made.SetOrigin([-(n - 1) / 2 * s for n, s in zip(size, spacing, strict=True)])
+        return made
+
+    def volume(values: np.ndarray) -> Any:
+        # RTK turns about its y axis.
+        return image(values.transpose(1, 0, 2), (grid.spacing[2], grid.spacing[0], grid.spacing[1]))
+
+    def stack(values: np.ndarray) -> Any:
+        made = image(values, (g.pitch[1], g.pitch[0], 1.0))
+        origin = made.GetOrigin()
+        made.SetOrigin([origin[0], origin[1], 0.0])
+        return made
+
+    lines, blank = case.exact["gaussians"], np.zeros(g.shape, np.float32)
+
+    def projected(values: np.ndarray) -> np.ndarray:
+        run = rtk.JosephForwardProjectionImageFilter[kind, kind].New()
+        run.SetInput(0, stack(blank))
+        run.SetInput(1, volume(values))
+        run.SetGeometry(turn)
+        run.Update()
+        return itk.array_from_image(run.GetOutput())
+
+    def back() -> Any:
+        run = rtk.JosephBackProjectionImageFilter[kind, kind].New()
+        run.SetInput(0, volume(np.zeros(grid.shape)))
+        run.SetInput(1, stack(lines))
+        run.SetGeometry(turn)
+        run.Update()
+        return run.GetOutput()
+
+    def reconstruct() -> np.ndarray:
+        run = rtk.FDKConeBeamReconstructionFilter[kind].New()
+        run.SetInput(0, volume(np.zeros(grid.shape)))
+        run.SetInput(1, stack(lines))
+        run.SetGeometry(turn)
+        run.Update()
+        return itk.array_from_image(run.GetOutput()).transpose(1, 0, 2)
+
+    x = case.images["gaussians"]
+    operations = {"forward": lambda: projected(x), "back": back, "FBP": reconstruct}
+    return Toolkit(operations, projected, reconstruct)
+
+
+TOOLKITS: dict[str, Callable[[Case], Toolkit | None]] = {
+    "torchpcct": of_torchpcct,
+    "ASTRA": of_astra,
+    "XCIST": of_xcist,
+    "RTK": of_rtk,
+}
+
+
+# --- one toolkit, in a process of its own ---------------------------------------------------------
+
+
+def _best_flip(found: np.ndarray, exact: np.ndarray) -> float:
+    """Relative L2 error, by whichever axes the toolkit counts backwards."""
+    norm = np.linalg.norm(exact)
+    axes = [()] + [(a,) for a in range(exact.ndim)] + [(-2, -1)]
+    return min(float(np.linalg.norm(np.flip(found, a) - exact) / norm) for a in axes)
+
+
+def serve(name: str, case: Case) -> None:
+    """Answer the lines of the standard input, each the name of an operation, with its seconds."""
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # whatever a toolkit prints is no answer
+    toolkit = TOOLKITS[name](case)
+
+    def answer(value: Any) -> None:
+        answers.write(json.dumps(value) + "\n")
+        answers.flush()
+
+    if toolkit is None:
+        answer(None)
+        return
+    answer(list(toolkit.operations))
+    for line in sys.stdin:
+        wanted = line.strip()
+        if wanted == "errors":
+            errors = {}
+            if toolkit.projected is not None:
+                errors["forward"] = _best_flip(
+                    toolkit.projected(case.images["gaussians"]),
+                    case.exact["gaussians"][:: toolkit.every],
+                )
+            if toolkit.reconstructed is not None:
+                errors["FBP"] = _best_flip(toolkit.reconstructed(), case.images["gaussians"])
+            answer(errors)
+            continue
+        begin = time.perf_counter(), time.process_time()
+        toolkit.operations[wanted]()
+        end = time.perf_counter(), time.process_time()
+        answer([(b - a) * toolkit.every for a, b in zip(begin, end, strict=True)])
+
+
+class Process:
+    """A toolkit at work on a case; ``operations`` is empty where it is not installed."""
+
+    def __init__(self, python: str, name: str, number: int, small: bool) -> None:
+        call = [python, __file__, "--worker", name, "--case", str(number)]
+        self._process = subprocess.Popen(
+            call + ["--small"] * small, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        self.operations: list[str] = self._answer() or []
+
+    def _answer(self) -> Any:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        return json.loads(line) if line else None
+
+    def ask(self, what: str) -> Any:
+        """Seconds (wall, processor) of an operation, or the ``errors``."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(what + "\n")
+        self._process.stdin.flush()
+        return self._answer()
+
+    def close(self) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait()
+
+
+# --- all of them ----------------------------------------------------------------------------------
+
+
+def measure(
+    python: str, names: list[str], number: int, label: str, small: bool, rounds: int
+) -> list[dict[str, Any]]:
+    """One row for each toolkit and operation."""
+    processes = {name: Process(python, name, number, small) for name in names}
+    rows = []
+    for name, process in processes.items():
+        errors = process.ask("errors") if process.operations else {}
+        for operation in process.operations:
+            row = {"case": label, "toolkit": name, "operation": operation, "steady": []}
+            rows.append({**row, "error": (errors or {}).get(operation)})
+    # The errors' calls have warmed some operations up: the first call is that of a new process.
+    for row in rows:
+        fresh = Process(python, row["toolkit"], number, small)
+        row["first_s"] = fresh.ask(row["operation"])[0]
+        fresh.close()
+    for _ in range(rounds):
+        for row in rows:
+            row["steady"].append(processes[row["toolkit"]].ask(row["operation"]))
+    for process in processes.values():
+        process.close()
+    for row in rows:
+        wall, processor = np.array(row.pop("steady")).T
+        row |= {"median_s": float(np.median(wall)), "least_s": float(wall.min())}
+        row["processor_s"] = float(np.median(processor))
+    return rows
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown; ``× torchpcct`` compares the medians."""
+    lines = [
+        "| case | operation | toolkit | s: median (least) | processor s | × torchpcct | first call "
+        "s | error |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    own = {(r["case"], r["operation"]): r["median_s"] for r in rows if r["toolkit"] == "torchpcct"}
+    for r in sorted(rows, key=lambda r: (r["case"], r["operation"])):
+        ratio = r["median_s"] / own.get((r["case"], r["operation"]), float("nan"))
+        error = "–" if r["error"] is None else f"{r['error']:.2e}"
+        lines.append(
+            f"| {r['case']} | {r['operation']} | {r['toolkit']} | {r['median_s']:.3f} "
+            f"({r['least_s']:.3f}) | {r['processor_s']:.3f} | {ratio:.1f} | {r['first_s']:.2f} | "
+            f"{error} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--small", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
+    parser.add_argument("--python", default=sys.executable)
+    parser.add_argument("--toolkits", nargs="+", choices=list(TOOLKITS), default=list(TOOLKITS))
+    parser.add_argument("--worker", help=argparse.SUPPRESS)
+    parser.add_argument("--case", type=int, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    cases = bench_cases(options.small)
+    if options.worker:
+        serve(options.worker, cases[options.case]())
+        return
+    options.out.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
+    for number in range(len(cases)):
+        label = cases[number]().name
+        names = options.toolkits
+        rows += measure(options.python, names, number, label, options.small, options.rounds)
+        now = datetime.datetime.now(datetime.UTC)
+        report = f"{_machine()}, {now:%Y-%m-%d %H:%M} UTC, load {os.getloadavg()[0]:.1f}\n\n"
+        (options.out / "peers.md").write_text(report + table(rows) + "\n")
+        (options.out / "peers.json").write_text(json.dumps(rows, indent=1))
+        print(table(rows), flush=True)
+
+
+if __name__ == "__main__":
+    main()
