@@ -55,7 +55,7 @@ from torchpcct.checks.readings import reading_warnings
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.formats.scans import adapted, open_scan, own_options
 from torchpcct.formats.volume_slabs import CHUNK, SlabFile, check_slab_name
-from torchpcct.geometry import Geometry, VolumeGrid
+from torchpcct.geometry import Beam, Geometry, VolumeGrid, beam
 from torchpcct.projector import Projector
 from torchpcct.readings import MOST_DEAD
 from torchpcct.scan import Scan
@@ -159,7 +159,7 @@ class ScanSlices:
         self.unit, self.water = self.first.unit, self.first.linearisation.mu_ref
         start, _, self.count = info["slices"]
         g = self.first.geometry
-        self.geometry: Any = g.with_rows(-start, self.count)
+        self.geometry: Geometry = g.with_rows(-start, self.count)
         lead = () if g.has_rows else (self.count,)
         self.counts = torch.empty((*lead, *self.geometry.shape), device="meta")
 
@@ -330,12 +330,12 @@ class _Fbp:
         self.plane = grid if self.cone else grid.slice
         self.weights = angular_weights(geometry, self.plane)
         self.wide: Any = self.complete(
-            torch.empty(geometry.shape, device="meta"), geometry
+            torch.empty(geometry.shape, device="meta"), beam(geometry)
         ).geometry
         self.window = read_window(self.wide, self.plane)
         self.plan = BackprojectionPlan(self.wide, self.plane, self.window)
 
-    def complete(self, lines: Tensor, geometry: Any) -> Rows:
+    def complete(self, lines: Tensor, geometry: Beam) -> Rows:
         rows = Rows(lines, geometry, self.weights)
         return mirrored(
             continued(rows, self.sides, self.water) if any(self.sides) else rows, self.plane
@@ -731,7 +731,7 @@ def _survey(source: ScanSlices, plan: SlabPlan) -> dict[str, Any]:
         ends = [row_ends((rows / source.count).float()[None])]
     highest, first_column, last_column = zip(*ends, strict=True)
     sides = ends_cut_off(
-        max(highest), torch.cat(first_column), torch.cat(last_column), g, angular_weights(g)
+        max(highest), torch.cat(first_column), torch.cat(last_column), beam(g), angular_weights(g)
     )
     return {"sides": sides, "dead_readings": dead, **_looked_at(source, plan, replaced, sides)}
 
@@ -743,7 +743,7 @@ def _looked_at(
     most = min(_LOOKED_AT, max(high - low for low, high in plan.bands), source.count)
     if cone:  # about the plane of the orbit
         first = int(
-            np.clip(round(-g.row_positions[0] / g.pitch[0]) - most // 2, 0, source.count - most)
+            np.clip(round(-g.row_positions[0] / g.row_pitch) - most // 2, 0, source.count - most)
         )
     else:
         most -= 1 - most % 2

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
@@ -23,6 +23,8 @@ __all__ = [
     "write_geometry",
     "write_scan",
 ]
+
+G = TypeVar("G", bound=Geometry)
 
 _VERSION = 5
 """2: energy-integrating scans with their noise model. 3: with a checksum
@@ -179,7 +181,7 @@ def slice_axis(geometry: Geometry, shape: tuple[int, ...], window: Any = None) -
     return 1 if geometry.has_rows else 0
 
 
-def sliced(geometry: Any, slices: slice, count: int) -> tuple[Any, list[int]]:
+def sliced(geometry: G, slices: slice, count: int) -> tuple[G, list[int]]:
     """Geometry of some of ``count`` slices or rows, and what a scan's ``info["slices"]`` says:
     first, stop, count."""
     first, stop, step = slices.indices(count)

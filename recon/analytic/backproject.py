@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.geometry import Geometry, ParallelBeam, VolumeGrid, beam
+from torchpcct.geometry import Beam, Geometry, ParallelBeam, VolumeGrid, beam
 from torchpcct.projector.operator import apply_linear
 from torchpcct.threads import run
 from torchpcct.validate import checked
@@ -112,7 +112,7 @@ class BackprojectionPlan:
         self.mask = self._outside(geometry)
         self._check_window(geometry)
 
-    def _outside(self, geometry: Any) -> NDArray[np.bool_] | None:
+    def _outside(self, geometry: Beam) -> NDArray[np.bool_] | None:
         """Voxel columns that some view may not see, or None. An inset must be seen whole.
 
         A grid that moves loses the voxels that its longest displacement could take out of the field

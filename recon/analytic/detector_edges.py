@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.angles import is_offset
-from torchpcct.geometry import Geometry, VolumeGrid
+from torchpcct.geometry import Beam, ConeBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.validate import checked
 
@@ -50,18 +50,18 @@ class Rows(NamedTuple):
     """
 
     lines: Tensor
-    geometry: Any
+    geometry: Beam
     weights: Floats
 
 
 @checked
-def reach(geometry: Any) -> Floats:
+def reach(geometry: Beam) -> Floats:
     """Distance from the axis of the ray to every column centre, signed, ``(columns,)`` mm."""
     return np.asarray(geometry.ray_distances)
 
 
 @checked
-def cut_off(lines: Tensor, geometry: Any, weights: Floats) -> tuple[bool, bool]:
+def cut_off(lines: Tensor, geometry: Beam, weights: Floats) -> tuple[bool, bool]:
     """Whether the rows end inside the object, at the first and at the last column.
 
     A side that the weights leave out (the short one of an offset detector) does not count.
@@ -80,7 +80,7 @@ def row_ends(means: Tensor) -> tuple[float, Tensor, Tensor]:
 
 
 def ends_cut_off(
-    highest: float, first: Tensor, last: Tensor, geometry: Any, weights: Floats
+    highest: float, first: Tensor, last: Tensor, geometry: Beam, weights: Floats
 ) -> tuple[bool, bool]:
     """:func:`cut_off` of what :func:`row_ends` says of a scan."""
     limit = _CUT * highest
@@ -94,7 +94,7 @@ def ends_cut_off(
     return found[0], found[1]
 
 
-def _leaves_out_short_side(weights: Floats, geometry: Any) -> bool:
+def _leaves_out_short_side(weights: Floats, geometry: Beam) -> bool:
     """Whether these are the weights of a full turn of an offset detector; a short scan needs
     both sides."""
     if weights.shape[1] == 1 or not is_offset(geometry):
@@ -121,11 +121,11 @@ def _rises(end: Tensor, limit: float) -> bool:
     return float((smooth > limit + margin).double().mean()) > _CUT_VIEWS
 
 
-def _room(geometry: Any) -> tuple[int, int]:
+def _room(geometry: Beam) -> tuple[int, int]:
     """Columns that fit before the first and behind the last one, as many as the detector has at
     most."""
     u, n = geometry.column_positions, geometry.columns
-    if geometry.parallel:
+    if isinstance(geometry, ParallelBeam):
         return n, n
     pitch = geometry.column_pitch
     far = geometry.sdd * (_WIDEST_RAD if geometry.detector == "curved" else math.tan(_WIDEST_RAD))
@@ -183,7 +183,9 @@ def continued(rows: Rows, sides: tuple[bool, bool], outside: float) -> Rows:
         )
         far = slice(0, space) if side == 0 else slice(first + g.columns, None)
         end = g.column_positions[0 if side == 0 else -1]
-        away = 1.0 if not cone else (g.sdd if g.detector == "curved" else math.hypot(g.sdd, end))
+        away = 1.0
+        if isinstance(g, ConeBeam):
+            away = g.sdd if g.detector == "curved" else math.hypot(g.sdd, end)
         # A ray that climbs crosses an upright cylinder on a path longer by 1 / cos of its slope.
         mu = outside * np.sqrt(1.0 + (heights / away) ** 2)
         last = rows.lines[..., :fit] if side == 0 else rows.lines[..., -fit:]

@@ -24,7 +24,7 @@ from recon.analytic.detector_edges import Rows, continued, cut_off, mirrored
 from recon.analytic.filter_plan import FilterPlan, kernel_names
 from torchpcct.angles import view_steps
 from torchpcct.detector_window import DetectorWindow, footprint
-from torchpcct.geometry import Geometry, VolumeGrid, view_step
+from torchpcct.geometry import Beam, Geometry, VolumeGrid, beam, view_step
 from torchpcct.projector.operator import apply_linear
 from torchpcct.readings import bridge
 from torchpcct.validate import checked, number, reals
@@ -140,13 +140,13 @@ def interleave(sinogram: Tensor, geometry: G) -> tuple[Tensor, G]:
         TypeError: a wrong dtype.
     """
     check_data("sinogram", sinogram, data_shape(geometry, DetectorWindow.full(geometry)))
-    _check_opposites(geometry)
+    _check_opposites(beam(geometry))
     # the mean of a reading and a zero is half the reading
     spread = torch.stack([2.0 * sinogram, torch.zeros_like(sinogram)], dim=-1).flatten(-2)
     return spread, geometry.interleaved()
 
 
-def _check_opposites(geometry: Any) -> None:
+def _check_opposites(geometry: Beam) -> None:
     """Whether the opposite rays that :func:`interleave` relies on were measured, and fall
     between two columns."""
     pitch, offset = geometry.column_pitch, geometry.column_offset
@@ -255,7 +255,10 @@ def fbp(
         _LOG.warning("%s", text)
     repaired = _without_dead(sinogram, geometry)
     rows = _completed(
-        Rows(repaired, geometry, _check_weights(weights, geometry, grid)), grid, motion, outside
+        Rows(repaired, beam(geometry), _check_weights(weights, geometry, grid)),
+        grid,
+        motion,
+        outside,
     )
     window = read_window(rows.geometry, grid, motion)
     filtered = filter_sinogram(rows.lines, rows.geometry, kernel, window, weights=rows.weights)

@@ -176,7 +176,7 @@ def _angles(value: Any, folder: Path) -> Any:
     return np.deg2rad(reals("angles_deg", value))
 
 
-def geometry_values(geometry: Any) -> dict[str, Any]:
+def geometry_values(geometry: Geometry) -> dict[str, Any]:
     """The mapping that :func:`geometry_of` reads; evenly spaced angles as start, step and count."""
     if isinstance(geometry, VectorGeometry):
         rows = {} if geometry.rows is None else {"rows": geometry.rows}
