@@ -80,11 +80,10 @@ def add_plaque(commands: Commands) -> None:
         commands,
         "plaque",
         _plaque,
-        "read a vessel's tissues: values, outlines and plaque bodies with intervals",
-        "Fit a contrast-enhanced vessel's tissues to a scan: outlines of lumen and outer wall, "
-        "tissue values, plaque "
-        "bodies with the probability that they are there; beside each figure what FBP reads over "
-        "the same regions.",
+        "fit a model of a vessel: CT numbers, outlines and plaque bodies with intervals",
+        "Fit a model of a contrast-enhanced vessel to a scan: outlines of lumen and outer wall, "
+        "one CT number per tissue, plaque bodies with the probability that they exist. Each value "
+        "is printed together with that of FBP over the same region.",
         "torchpcct plaque plaque.h5 --beside mbir --out reading",
         out="folder for report.md, report.json, tissues.nii.gz, image.nii.gz and plaque.png "
         "(default out/plaque)",

@@ -857,11 +857,16 @@ def add_reconstruct(commands: Commands) -> None:
             "--vessel",
             bool,
             None,
-            "MBIR of an inset around a vessel with smooth outlines, which is drawn first: "
-            "sharper, but disease with "
-            "other outlines may be missing; what the drawing changed is written beside the volume",
+            "MBIR of an inset: fit a vessel with smooth outlines to the data first, and let the "
+            "network reconstruct the rest; sharper, but disease with other outlines may be "
+            "missing. The difference from the volume without it is written to a second file",
         ),
-        ("--tissues", bool, None, "MBIR that first fits the tissues of the vessel in the inset"),
+        (
+            "--tissues",
+            bool,
+            None,
+            "MBIR of an inset: fit the vessel's tissues (values and a core) to the data first",
+        ),
         (
             "--weights",
             Path,
