@@ -34,7 +34,15 @@ from torchpcct.scene.scene import Scene
 from torchpcct.validate import choice, number, numbers, whole
 from torchpcct.volume import Volume
 
-__all__ = ["AnatomyTask", "VesselTask", "VoxelTask", "read_task", "task_text"]
+__all__ = [
+    "AnatomyTask",
+    "VesselTask",
+    "VoxelTask",
+    "read_task",
+    "task_text",
+    "with_painted",
+    "without_inset",
+]
 
 Floats = NDArray[np.float64]
 
@@ -265,8 +273,8 @@ class VesselTask(Task):
                 hu = {
                     n: v - values[self.scene.names[0]] for n, v in {**values, "core": core}.items()
                 }
-                made = _with(
-                    _without_inset(straight[1]), self.grid, partial(self._vessel.painted, values=hu)
+                made = with_painted(
+                    without_inset(straight[1]), self.grid, partial(self._vessel.painted, values=hu)
                 )
                 store.keep_scan(made, path)
         present, absent = (Scan.load(p) for p in paths)
@@ -340,7 +348,7 @@ class _PaintedTask(Task):
             here = self._patient_hu(seen, self._bodies(seen))
             hu = {tissue: value - here for tissue, value in self.tissues_hu.items()}
             painted = partial(self._painted, values=hu, signal=signal == "present")
-            store.keep_scan(_with(plain, self.grid, painted), path)
+            store.keep_scan(with_painted(plain, self.grid, painted), path)
         return Scan.load(path)
 
     def _alone(self, store: Store) -> Scan:
@@ -587,14 +595,14 @@ def _about_middle(grid: VolumeGrid, inset: VolumeGrid) -> VolumeGrid:
     )
 
 
-def _without_inset(scan: Scan) -> Scan:
+def without_inset(scan: Scan) -> Scan:
     """The scan of what surrounds the inset alone."""
     assert scan.surround is not None
     assert scan.window is not None
     return replace(scan, counts=scan.window.take(scan.surround).to(scan.counts))
 
 
-def _with(scan: Scan, inset: VolumeGrid, painted: Callable[[VolumeGrid], Floats]) -> Scan:
+def with_painted(scan: Scan, inset: VolumeGrid, painted: Callable[[VolumeGrid], Floats]) -> Scan:
     """A noise-free scan, and in its inset the HU that are painted on a grid of half its voxels
     added."""
     fine = VolumeGrid(tuple(2 * n for n in inset.shape), inset.spacing[0] / 2, inset.center)

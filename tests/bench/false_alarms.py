@@ -2,8 +2,9 @@
 sizes right?
 
     python tests/bench/false_alarms.py [--n 500] [--first 0] [--kind cone] [--method fbp]
-    [--readings 600000] python tests/bench/false_alarms.py --errors [--n 500] [--first 0] [--kind
-    cone]
+    [--readings 600000]
+    python tests/bench/false_alarms.py --method pwls --n 100 --readings 20000
+    python tests/bench/false_alarms.py --errors [--n 500] [--first 0] [--kind cone]
 
 Without ``--method`` only the checks run that :func:`recon.reconstruct` runs for every method; with
 it the whole reconstruction, and every warning of its report counts that accuses the scan; of PWLS

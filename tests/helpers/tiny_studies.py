@@ -41,6 +41,9 @@ TINY: dict[str, dict[str, Any]] = {
             "body-reversed",
             "body-not-square",
         ),
+        "anatomies": ("ulcer",),
+        "anatomy_methods": ("pwls",),
+        "draws": 1,
     },
     "motion": {
         "thinning": 24,

@@ -553,6 +553,7 @@ _SIZED = (
     "an object that is larger by as much and attenuates as much less has the same line integrals"
 )
 _FAINT = "neighbouring views differ by less than their noise"
+_WITHIN_EDGES = "cells at edges and bones change the sum of a view by as much"
 _PLANE = "only the plane of the source has opposite rays, and rows beside it are averaged"
 _SCALED = "line integrals tell attenuation, not what of it is water's"
 
@@ -701,7 +702,7 @@ _BODY: dict[str, Case] = {
         "saturated at half of air",
         _expected(lambda n, air, rng: n.clamp(max=0.5 * float(air.mean()))),
     ),
-    "pile-up": _PLAQUE["pile-up"],
+    "pile-up": replace(_PLAQUE["pile-up"], unseen=_WITHIN_EDGES),
     "hardening": Case(
         "beam hardening, not corrected",
         _expected(lambda n, air, rng: air * torch.exp(-(p := torch.log(air / n)) + 0.015 * p**2)),

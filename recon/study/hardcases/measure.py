@@ -20,8 +20,11 @@ import numpy as np
 import torch
 
 from recon import reconstruct
+from recon.evaluate.anatomies import ANATOMIES
 from recon.jobs.execute import heard
 from recon.jobs.store import Pieces
+from recon.study.hardcases.anatomies import METHODS as ANATOMY_METHODS
+from recon.study.hardcases.anatomies import anatomy_rows
 from recon.study.hardcases.cases import (
     CASES,
     CONE_GRID,
@@ -54,6 +57,21 @@ anyway: 12 % more."""
 WORSE = 1.05
 """A method that is further from the truth than soft FBP of the same scan by more than this
 factor has to say so."""
+DISEASE = (
+    "ulcer",
+    "thrombus",
+    "flap",
+    "calcification",
+    "stent",
+    "inflamed_30",
+    "inflamed_15",
+    "branch",
+    "second",
+    "thin_cap",
+    "stenosis",
+    "occlusion",
+)
+"""Anatomies that break what a prior for vessels assumes."""
 _ROWS = 20
 _GRID_MM = (6.4, 9.2, 9.2)
 _COLOURS = {"right": "tab:green", "warned": "tab:orange", "unseen": "tab:grey", "SILENT": "tab:red"}
@@ -72,6 +90,9 @@ class Settings(StudySettings):
         methods: of :func:`recon.reconstruct`; ``"tissues"``: MBIR with them, of some scans of the
             plaque. The cone beam is reconstructed by FBP alone.
         cases: names of :data:`recon.study.hardcases.cases.CASES`.
+        anatomies: names of :data:`recon.evaluate.anatomies.ANATOMIES`.
+        anatomy_methods: of :data:`recon.study.hardcases.anatomies.METHODS`.
+        draws: of the noise of each anatomy, beside the scan without noise.
     """
 
     views: int = 360
@@ -80,11 +101,20 @@ class Settings(StudySettings):
     seed: int = 0
     methods: tuple[str, ...] = ("fbp", "pwls", "mbir", "tissues")
     cases: tuple[str, ...] = tuple(CASES)
+    anatomies: tuple[str, ...] = DISEASE
+    anatomy_methods: tuple[str, ...] = ANATOMY_METHODS
+    draws: int = 3
 
-    QUICK: ClassVar = {"views": 120, "methods": ("fbp",)}
+    QUICK: ClassVar = {
+        "views": 120,
+        "methods": ("fbp",),
+        "anatomies": ("ulcer",),
+        "anatomy_methods": ("pwls", "mbir"),
+        "draws": 1,
+    }
 
     def __post_init__(self) -> None:
-        self.check_whole(views=120, seed=0)
+        self.check_whole(views=120, seed=0, draws=0)
         number("exposure_s", self.exposure_s, positive=True, unit="s")
         number("voxel_mm", self.voxel_mm, positive=True, unit="mm")
         for name in ("methods", "cases"):
@@ -92,6 +122,10 @@ class Settings(StudySettings):
                 raise ValueError(f"{name} must be one name or more, got {getattr(self, name)!r}")
         for name in self.cases:
             choice("case", name, CASES)
+        for name in self.anatomies:
+            choice("anatomy", name, ANATOMIES)
+        for name in self.anatomy_methods:
+            choice("method of an anatomy", name, ANATOMY_METHODS)
 
 
 def verdict(
@@ -131,10 +165,13 @@ def measure(
     the error against the truth; None if refused), ``noise_hu`` (rms of the sound scan's noise),
     ``finite``, ``messages`` (warnings, or the refusal), ``refused``, ``seconds``, ``verdict``,
     ``truth_hu`` (rms of the difference to the truth), ``soft_hu`` (that of soft FBP from the same
-    scan; either is None if refused).
+    scan; either is None if refused). ``anatomies``: rows of
+    :func:`recon.study.hardcases.anatomies.anatomy_rows`.
     """
     pieces = Pieces(folder, settings)
     used = {CASES[name].base for name in settings.cases}
+    if settings.anatomies:
+        used.add("plaque")
     bases = {
         name: make(settings, pieces.within(name), progress)
         for name, make in _BASES.items()
@@ -152,8 +189,14 @@ def measure(
     for k, name in enumerate(settings.cases):
         rows += _case(settings, pieces, name, bases[CASES[name].base])
         progress("cases", (k + 1) / len(settings.cases))
+    diseased = []
+    pieces.ahead(_anatomy, *((name,) for name in settings.anatomies))
+    for k, name in enumerate(settings.anatomies):
+        diseased += _anatomy(settings, pieces, name, bases["plaque"])
+        progress("anatomies", (k + 1) / len(settings.anatomies))
     counts = Counter(row["verdict"] for row in rows)
     data = {
+        "anatomies": diseased,
         "rows": rows,
         "cases": len(settings.cases),
         "verdicts": dict(counts),
@@ -300,6 +343,25 @@ def _case(
         row = pieces(method, run)
         rows.append({"case": name, "base": case.base, "title": case.title, "method": method, **row})
     return rows
+
+
+def _anatomy(
+    settings: Settings, pieces: Pieces, name: str, base: _Base | None = None
+) -> list[dict[str, Any]]:
+    """See :func:`recon.study.hardcases.anatomies.anatomy_rows`."""
+    base = base or _BASES["plaque"](settings, pieces.within("plaque"), silent)
+    return anatomy_rows(
+        name,
+        base.clean,
+        base.grid,
+        exposure_s=settings.exposure_s,
+        seed=settings.seed,
+        draws=settings.draws,
+        methods=settings.anatomy_methods,
+        reconstruct=_reconstruct,
+        kind=_kind,
+        pieces=pieces.within(f"anatomy_{name}"),
+    )
 
 
 def _truth(scene: Scene, scanner: Scanner, grid: VolumeGrid) -> torch.Tensor:

@@ -1,0 +1,171 @@
+"""Disease that a prior for vessels may close, flatten or draw away: what each method shows of it,
+beside soft FBP of the same scan.
+
+Each anatomy of :data:`recon.evaluate.anatomies.ANATOMIES` is painted into the plaque's place, with
+its feature and without it, and scanned with the same noise. The difference of the two volumes is
+what a method shows of the feature: its mean over the voxels that the feature changes by more than
+half of what it changes at most, over that of the truth, is the *recovery*. A method that recovers
+less than soft FBP does, times :data:`LEAST_RECOVERY`, shows less than the data do, and has to say
+so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon.evaluate.anatomies import TISSUES_HU, Anatomy, anatomy
+from recon.evaluate.tasks import with_painted, without_inset
+from recon.jobs.execute import heard
+from recon.jobs.store import Pieces
+from torchpcct.geometry import VolumeGrid
+from torchpcct.scan import Scan
+from torchpcct.volume import Volume
+
+__all__ = ["LEAST_RECOVERY", "METHODS", "anatomy_rows", "anatomy_verdict", "recovery"]
+
+LEAST_RECOVERY = 0.9
+"""Share of what soft FBP recovers of a feature's contrast that a method may not fall below without
+a word."""
+METHODS = ("pwls", "mbir", "mbir:vessel")
+"""``"mbir:vessel"``: MBIR with ``vessel=True``."""
+
+Reconstruct = Callable[[Scan, VolumeGrid, str], Volume]
+
+
+def recovery(shown: Tensor, truth: Tensor) -> float:
+    """Share of a feature's contrast that a difference of two volumes shows.
+
+    Args:
+        shown: a volume with the feature less one without it, HU.
+        truth: the same of the scenes, HU.
+    """
+    where = truth.abs() > 0.5 * float(truth.abs().max())
+    return float((shown * truth.sign())[where].mean() / truth.abs()[where].mean())
+
+
+def anatomy_verdict(recovered: float | None, soft: float, messages: Sequence[str]) -> str:
+    """``right``, ``warned`` (less than soft FBP shows, or refused, with a message) or ``SILENT``.
+
+    Args:
+        recovered: see :func:`recovery`; None: refused.
+        soft: of soft FBP.
+        messages: of the volume with the feature beside those of the volume without it, and what
+            says that a vessel was drawn.
+    """
+    if recovered is not None and recovered >= LEAST_RECOVERY * soft:
+        return "right"
+    return "warned" if messages else "SILENT"
+
+
+def anatomy_rows(
+    name: str,
+    clean: Scan,
+    grid: VolumeGrid,
+    *,
+    exposure_s: float,
+    seed: int,
+    draws: int,
+    methods: Sequence[str],
+    reconstruct: Reconstruct,
+    kind: Callable[[str], str],
+    pieces: Pieces,
+) -> list[dict[str, Any]]:
+    """A row for each method, without noise and as the mean over draws of it: ``anatomy``,
+    ``title``, ``method``, ``draws`` (0: without noise), ``recovered`` (None if refused), ``soft``,
+    ``messages``, ``verdict``.
+
+    Args:
+        name: of the anatomy.
+        clean: noise-free scan of the inset ``grid``, whose surround is the patient.
+        draws: of the noise, from ``seed`` on.
+        methods: of :data:`METHODS`.
+        reconstruct: by ``"soft"`` (FBP) or a method.
+        kind: a warning without its figures.
+        pieces: keep what is finished.
+    """
+    what, rows = anatomy(name), []
+    with_it, without = (_scanned(what, clean, grid, feature=f) for f in (True, False))
+    truth = torch.from_numpy(
+        _painted(what, grid, grid, feature=True) - _painted(what, grid, grid, feature=False)
+    ).float()
+    realisations: list[tuple[int, list[tuple[Scan, Scan]]]] = [(0, [(with_it, without)])]
+    if draws:
+        seeds = range(seed, seed + draws)
+        drawn = [
+            (with_it.with_noise(exposure_s, k), without.with_noise(exposure_s, k)) for k in seeds
+        ]
+        realisations.append((draws, drawn))
+    for number, pairs in realisations:
+
+        def shown(method: str, pairs: Any = pairs) -> tuple[float | None, list[str]]:
+            return _recovered(pairs, grid, method, truth, reconstruct, kind)
+
+        soft, _ = pieces(f"{name}_{number}_soft", lambda shown=shown: shown("soft"))
+        for method in methods:
+            recovered, messages = pieces(
+                f"{name}_{number}_{method.replace(':', '_')}",
+                lambda shown=shown, method=method: shown(method),
+            )
+            rows.append(
+                {
+                    "anatomy": name,
+                    "title": what.title,
+                    "method": method,
+                    "draws": number,
+                    "recovered": recovered,
+                    "soft": soft,
+                    "messages": messages,
+                    "verdict": anatomy_verdict(recovered, soft, messages),
+                }
+            )
+    return rows
+
+
+def _recovered(
+    pairs: Sequence[tuple[Scan, Scan]],
+    grid: VolumeGrid,
+    method: str,
+    truth: Tensor,
+    reconstruct: Reconstruct,
+    kind: Callable[[str], str],
+) -> tuple[float | None, list[str]]:
+    """Mean :func:`recovery` over pairs of scans, None if one is refused, and the messages."""
+    found, said = [], []
+    for pair in pairs:
+        volumes, texts = [], []
+        for scan in pair:
+            with heard("recon", "torchpcct", alone=True) as messages:
+                try:
+                    volume = reconstruct(scan, grid, method)
+                except (ValueError, TypeError) as error:
+                    return None, [str(error)]
+            volumes.append(volume.data)
+            texts.append([*volume.report.get("warnings", []), *messages])
+        usual = set(map(kind, texts[1]))
+        # A drawing says of itself what it may leave out, whatever it draws.
+        said += [t for t in texts[0] if kind(t) not in usual or "was drawn, and disease" in t]
+        found.append(recovery(volumes[0] - volumes[1], truth))
+    return float(np.mean(found)), list(dict.fromkeys(said))
+
+
+def _scanned(what: Anatomy, clean: Scan, grid: VolumeGrid, *, feature: bool) -> Scan:
+    """The noise-free scan of the patient with an anatomy in its inset."""
+    return with_painted(
+        without_inset(clean), grid, lambda fine: _painted(what, fine, grid, feature=feature)
+    )
+
+
+def _painted(
+    what: Anatomy, fine: VolumeGrid, grid: VolumeGrid, *, feature: bool
+) -> NDArray[np.float64]:
+    """HU above fat, about the middle of ``grid``."""
+    centre = tuple(a - b for a, b in zip(fine.center, grid.center, strict=True))
+    above = {t: hu - TISSUES_HU["fat"] for t, hu in what.values.items()}
+    return what.painted(replace(fine, center=centre), above, feature=feature)
