@@ -140,7 +140,7 @@ def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     options: dict[str, Any] = (
         {} if voxels else {"region": config.region, "tolerance_hu": config.tolerance_hu}
     )
-    if not (voxels or arguments.fresh):
+    if not isinstance(config.scene, VoxelScene) and not arguments.fresh:
         options["keep"] = ReadingsFolder(
             readings_key(config.scene, config.scanner, rotation_s=config.exposure_s, **options)
         )

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchpcct.acquisition.bodies import Bodies
-from torchpcct.acquisition.kept import MOST_BYTES, Known, fingerprint, recall, remember
+from torchpcct.acquisition.kept import MOST_BYTES, KnownReadings, fingerprint, recall, remember
 from torchpcct.acquisition.plan import Plan, make_plan
 from torchpcct.acquisition.spectra import signal_spectra
 from torchpcct.acquisition.transmission import SUB_RAY_COUNTS, Beam, compress, expected_readings
@@ -149,14 +149,14 @@ def acquire(
         plan_ = known.plan
     log.info("%s", plan_.table())
     energies, _, air = signal_spectra(scanner)
-    used = energies[plan_.nodes.index]
+    used = energies[plan_.nodes.indices]
     beam = Beam(plan_.nodes.spectra, scanner.row_factor, scanner.source.focal_spot, plan_.points)
     if known is None:
         # One view for all: the densest sampling of every effect costs nothing here.
         dense, one = beam._replace(points=sub_rays_of(SUB_RAY_COUNTS[-1])), g.select([0])
         symmetric, step = bodies.symmetric(used, one), np.array([bodies.view_step])
         seen = expected_readings(one, DetectorWindow.full(one), symmetric, dense, step)
-        known = Known(plan_, seen.numpy()[:, 0], {})
+        known = KnownReadings(plan_, seen.numpy()[:, 0], {})
     surround = known.surround
     counts = _readings(plan_, bodies, scanner, used, beam, known, progress, keep or _computed)
     remember(key, known)
@@ -190,7 +190,7 @@ def _readings(
     scanner: Scanner,
     energies: Any,
     beam: Beam,
-    known: Known,
+    known: KnownReadings,
     progress: Any,
     keep: Any,
 ) -> Tensor:

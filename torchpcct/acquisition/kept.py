@@ -25,7 +25,7 @@ from torch import Tensor
 
 from torchpcct.cache_folder import private_folder
 
-__all__ = ["MOST_BYTES", "Known", "ReadingsFolder", "fingerprint", "forget_readings"]
+__all__ = ["MOST_BYTES", "KnownReadings", "ReadingsFolder", "fingerprint", "forget_readings"]
 
 MOST_BYTES = 2**28
 """Of the readings held in memory, of all scenes together; the folder holds twice as many."""
@@ -33,7 +33,7 @@ _SOURCES = ("acquisition", "scene", "scanner")
 """Packages whose code decides what a reading is."""
 
 
-class Known(NamedTuple):
+class KnownReadings(NamedTuple):
     """What :func:`torchpcct.acquire` computed of one scene and scanner.
 
     Attributes:
@@ -52,7 +52,7 @@ class Known(NamedTuple):
         return sum(block.nbytes for block in self.blocks.values()) + self.surround.nbytes
 
 
-_held: OrderedDict[str, Known] = OrderedDict()
+_held: OrderedDict[str, KnownReadings] = OrderedDict()
 _lock = threading.Lock()
 
 
@@ -75,16 +75,16 @@ def _code() -> bytes:
     return digest.digest()
 
 
-def recall(key: str | None) -> Known | None:
+def recall(key: str | None) -> KnownReadings | None:
     """What is held for a fingerprint; it becomes the latest."""
     with _lock:
-        if key not in _held:
+        if key is None or key not in _held:
             return None
         _held.move_to_end(key)
         return _held[key]
 
 
-def remember(key: str | None, known: Known) -> None:
+def remember(key: str | None, known: KnownReadings) -> None:
     """Hold readings; of others the oldest are released until all fit."""
     if key is None or known.bytes > MOST_BYTES:
         return

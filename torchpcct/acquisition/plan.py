@@ -116,7 +116,7 @@ class Plan:
         return {
             "tolerance_hu": self.tolerance_hu,
             "effects": [vars(e) for e in self.effects],
-            "energies": len(self.nodes.index),
+            "energies": len(self.nodes.indices),
             "sub_rays": len(self.points),
             "sampling_error_of_peak": self.sampling_error,
             "readings": self.readings,
@@ -192,7 +192,7 @@ class _Probe:
         spectra = self.spectra[:bins].sum(0, keepdims=True)
         air = np.einsum("bce,r->rc", spectra, self.scanner.row_factor)
         if nodes is not None:
-            energies = energies[nodes.index]
+            energies = energies[nodes.indices]
             spectra = nodes.spectra[:bins].sum(0, keepdims=True)
         if mono:
             mean = np.einsum("bce,e->bc", spectra, energies) / spectra.sum(-1)
@@ -326,7 +326,7 @@ def make_plan(
     omitted = cost(fewer - probe.run(chosen, count))
     if omitted > tolerance_hu:
         nodes = Nodes.all_of(probe.spectra)
-    number_of = f"{len(nodes.index)} of {len(probe.energies)} energies"
+    number_of = f"{len(nodes.indices)} of {len(probe.energies)} energies"
     effects.insert(1, Effect("every energy", omitted > tolerance_hu, omitted, number_of))
     window = active_window(g, bodies) if bodies.varying else None
     busy = g.rows * g.columns if window is None else math.prod(window.shape)

@@ -36,12 +36,12 @@ class Nodes(NamedTuple):
     """Energies that stand for a spectrum.
 
     Attributes:
-        index: ``(nodes,)`` indices of the energies.
+        indices: ``(nodes,)`` indices of the energies.
         spectra: ``(bins, columns, nodes)`` weights of the transmissions there.
         error: largest relative error of a reading that was found; 0 of all energies.
     """
 
-    index: NDArray[np.int64]
+    indices: NDArray[np.int64]
     spectra: Floats
     error: float
 

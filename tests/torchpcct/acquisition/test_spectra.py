@@ -28,12 +28,12 @@ def test_nodes_sum_a_spectrum_to_their_error(scene, system):
         energies, system.geometry
     )
     nodes = energy_nodes(mu, longest, spectra)
-    assert len(nodes.index) <= len(energies) // 2
+    assert len(nodes.indices) <= len(energies) // 2
     assert 0 < nodes.error <= NODE_ERROR
     paths = np.random.default_rng(7).random((50, len(longest))) ** 2 * longest
     transmitted = np.exp(-paths @ mu)
     exact = np.einsum("bce,pe->bcp", spectra, transmitted)
-    found = np.einsum("bce,pe->bcp", nodes.spectra, transmitted[:, nodes.index])
+    found = np.einsum("bce,pe->bcp", nodes.spectra, transmitted[:, nodes.indices])
     seen = spectra.sum(-1) > 0
     assert np.abs(found[seen] / exact[seen] - 1).max() < 2 * NODE_ERROR
 
@@ -45,10 +45,10 @@ def test_metal_keeps_every_energy_rather_than_an_error():
     nodes = energy_nodes(*bodies.attenuation(energies, system.geometry), spectra)
     assert nodes.error <= NODE_ERROR
     one = energy_nodes(np.ones((1, 1)), np.ones(1), np.ones((1, 3, 1)))
-    assert len(one.index) == 1
+    assert len(one.indices) == 1
     assert one.error == 0.0
     dark = energy_nodes(np.ones((1, 9)), np.ones(1), np.zeros((1, 3, 9)))
-    assert len(dark.index) == 9
+    assert len(dark.indices) == 9
 
 
 def test_a_scan_of_nodes_is_that_of_every_energy(scene):
