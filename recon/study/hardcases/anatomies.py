@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -107,12 +108,10 @@ def anatomy_rows(
         def shown(method: str, pairs: Any = pairs) -> tuple[float | None, list[str]]:
             return _recovered(pairs, grid, method, truth, reconstruct, kind)
 
-        soft, _ = pieces(f"{name}_{number}_soft", lambda shown=shown: shown("soft"))
+        soft, _ = pieces(f"{name}_{number}_soft", partial(shown, "soft"))
         for method in methods:
-            recovered, messages = pieces(
-                f"{name}_{number}_{method.replace(':', '_')}",
-                lambda shown=shown, method=method: shown(method),
-            )
+            piece = f"{name}_{number}_{method.replace(':', '_')}"
+            recovered, messages = pieces(piece, partial(shown, method))
             rows.append(
                 {
                     "anatomy": name,
