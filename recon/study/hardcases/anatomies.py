@@ -108,7 +108,9 @@ def anatomy_rows(
         def shown(method: str, pairs: Any = pairs) -> tuple[float | None, list[str]]:
             return _recovered(pairs, grid, method, truth, reconstruct, kind)
 
-        soft, _ = pieces(f"{name}_{number}_soft", partial(shown, "soft"))
+        soft, refusal = pieces(f"{name}_{number}_soft", partial(shown, "soft"))
+        if soft is None:
+            raise ValueError(f"soft FBP, the reference, refuses the anatomy {name}: {refusal[0]}")
         for method in methods:
             piece = f"{name}_{number}_{method.replace(':', '_')}"
             recovered, messages = pieces(piece, partial(shown, method))
