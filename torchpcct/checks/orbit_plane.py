@@ -126,7 +126,8 @@ def orbit_plane(lines: Tensor, geometry: ConeBeam) -> OrbitPlane | None:
             )
         away = _spread(change, off_axis) if square > 0 else 0.0
         parted = PARTED * 4.0 * square * away / geometry.sod**2
-        sums, all_of_it = change.mean(1), float(mean.mean())
+        # Of absolute values: what all views share may have been taken off the line integrals.
+        sums, all_of_it = change.mean(1), float(mean.abs().mean())
         # Of a body thinner than a row every row steps, and the means may be alike.
         ends_within = max(float(sums.abs().mean()), stepping / rows)
         share = ends_within / all_of_it if all_of_it > 0 else 1.0

@@ -57,7 +57,7 @@ def test_refusals(spectral, run):
             "surround must have the shape",
             lambda: InsetFbp(clean, [GRID], ["standard"], surround=around[..., :9]),
         ),
-        ("decompose or sum", lambda: InsetFbp(clean, [GRID], ["standard"])),
+        ("decompose the energy bins, or sum", lambda: InsetFbp(clean, [GRID], ["standard"])),
         ("beyond the region", lambda: InsetFbp(clean, [beside], ["standard"], surround=around)),
         (
             "ray_covariance",
