@@ -517,8 +517,7 @@ def reconstruct_to(
 
     Returns:
         The report: that of a volume, with the plan as ``slabs``, ``memory_bytes``; ``resumed_at``,
-            the first slice of
-        this call; ``minimum``, ``maximum`` and ``mean`` of what it wrote.
+        the first slice of this call; ``minimum``, ``maximum`` and ``mean`` of what it wrote.
 
     Raises:
         ValueError: a limit that is too small, naming the smallest that works; a scan, grid or

@@ -39,11 +39,10 @@ def view_steps(
 
     Returns:
         ``steps`` ``(views,)`` rad: half the gap to the neighbours on either side, shared among
-        views at the same angle;
-        ``start`` and ``span`` of the covered arc in rad. A gap of more than three median steps ends
-            the scan: the views
-        beside it then stand for as much on the open side as on the other, and ``span < period``.
-        Without such a gap the scan is closed, ``span == period`` and the steps add up to it.
+        views at the same angle; ``start`` and ``span`` of the covered arc in rad. A gap of more
+        than three median steps ends the scan: the views beside it then stand for as much on the
+        open side as on the other, and ``span < period``. Without such a gap the scan is closed,
+        ``span == period`` and the steps add up to it.
     """
     wrapped = np.mod(angles, period)
     order = np.argsort(wrapped, kind="stable")

@@ -501,8 +501,7 @@ def bridge(lines: Tensor, dead: Tensor, rows: bool, most: float = MOST_DEAD) -> 
 
     Returns:
         Tensor of the shape and dtype of ``lines``: linear in the live readings, differentiable, and
-            independent of
-        what the dead ones hold.
+        independent of what the dead ones hold.
 
     Raises:
         ValueError: a view of which more than ``most`` is dead; no live reading at all.

@@ -63,8 +63,7 @@ def train(
 
     Returns:
         Where the run is at the end, and the number of the signal that ended it: 0 if there was
-            none, or if it came to
-        another process.
+        none, or if it came to another process.
 
     Raises:
         FileExistsError: ``out`` is not empty, and ``resume`` is false.

@@ -158,9 +158,8 @@ def angular_weights(geometry: Geometry, grid: VolumeGrid | None = None) -> Float
     Returns:
         ``(views, columns)``, or ``(views, 1)`` where all columns share one weight; float64, rad.
         Parallel: the steps over π. Divergent: half the steps over a closed circle, Parker's smooth
-            weights over an arc.
-        A full turn of an offset detector (:func:`torchpcct.angles.is_offset`): the steps times
-            :func:`offset_share`.
+        weights over an arc. A full turn of an offset detector (:func:`torchpcct.angles.is_offset`):
+        the steps times :func:`offset_share`.
 
     Raises:
         ValueError: the views cover less than π (parallel) or π plus the fan angle (divergent), or

@@ -505,8 +505,7 @@ def measured_before(
 
     Returns:
         Names of the methods that were measured at these tasks, exposures and realisations, and
-        whose pieces are all
-        there: they cost nothing. Of others the log says why they are left out.
+        whose pieces are all there: they cost nothing. Of others the log says why they are left out.
     """
     try:
         settings = json.loads(report.read_text(encoding="utf-8"))["settings"]

@@ -298,16 +298,14 @@ def evaluate_volumes(
 
     Returns:
         For each method: ``method``; ``noise`` of a voxel of one volume; ``noise_shared``, the same
-            at the frequencies
-        that the reference's two volumes agree on; ``noise_reference``: of the reference there, as
-        sharp as the method;
-        ``dose_factor``: the ratio of the last two variances, ``low`` and ``high`` its 95 %
-            interval; ``f50`` and
-        ``f50_z``, line pairs per mm in the plane and along z at which half of the reference's
-        signal is left (inf: it does not fall so far as the object shows); ``resolution`` and
-        ``resolution_z``, up to which the reference's volumes agree; ``why`` there is no factor,
-        which then is NaN (else empty); ``note``: on what the factors depend, as the voxels of the
-        reference must not be coarser than the detector's cells (empty: they are not).
+        at the frequencies that the reference's two volumes agree on; ``noise_reference``: of the
+        reference there, as sharp as the method; ``dose_factor``: the ratio of the last two
+        variances, ``low`` and ``high`` its 95 % interval; ``f50`` and ``f50_z``, line pairs per mm
+        in the plane and along z at which half of the reference's signal is left (inf: it does not
+        fall so far as the object shows); ``resolution`` and ``resolution_z``, up to which the
+        reference's volumes agree; ``why`` there is no factor, which then is NaN (else empty);
+        ``note``: on what the factors depend, as the voxels of the reference must not be coarser
+        than the detector's cells (empty: they are not).
 
     Raises:
         ValueError: volumes of other shapes, NaN; constant ones, or two that are the same.

@@ -359,20 +359,20 @@ def minimise(
 
     Returns:
         The volumes, as ``term.b``, and the report: ``exact_pairs`` (A and Aᵀ applied together),
-            ``inner_iterations`` (of the FFT model, one entry per outer iteration), ``gradient``
-            (norm of the exact gradient of Φ over that of the zero volume, worst volume of the
-            batch, one entry per outer iteration), ``rmsd_hu`` (root mean square distance to the
-            minimum in HU, worst volume, one entry per outer iteration: as the FFT model sees it
-            from the exact gradient and its steps shrink (``ahead``); for a whole field extrapolated
-            from the latest steps, over the voxels that the data determine:
-            ``recon.least_squares.field_model.FieldModel.determined``), ``undetermined`` (share of
-            the other voxels), ``undetermined_rmsd_hu`` (the same estimate over them),
-            ``converged``, ``tolerance_hu``, ``model`` ("gram" or "gradient": who proposed the last
-            step), ``model_misfit`` (of the FFT model on the first step, None without one),
-            ``misfit`` (weighted squared residual per reading of positive weight, one entry per
-            volume: about 1 for the right weights and many more readings than unknowns; None where
-            the data term does not know its readings), ``seconds``, and the prior (``strength``,
-            ``lambda``, ``threshold_hu_per_mm``, ``p``, ``q``).
+        ``inner_iterations`` (of the FFT model, one entry per outer iteration), ``gradient`` (norm
+        of the exact gradient of Φ over that of the zero volume, worst volume of the batch, one
+        entry per outer iteration), ``rmsd_hu`` (root mean square distance to the minimum in HU,
+        worst volume, one entry per outer iteration: as the FFT model sees it from the exact
+        gradient and its steps shrink (``ahead``); for a whole field extrapolated from the latest
+        steps, over the voxels that the data determine:
+        ``recon.least_squares.field_model.FieldModel.determined``), ``undetermined`` (share of the
+        other voxels), ``undetermined_rmsd_hu`` (the same estimate over them), ``converged``,
+        ``tolerance_hu``, ``model`` ("gram" or "gradient": who proposed the last step),
+        ``model_misfit`` (of the FFT model on the first step, None without one), ``misfit``
+        (weighted squared residual per reading of positive weight, one entry per volume: about 1 for
+        the right weights and many more readings than unknowns; None where the data term does not
+        know its readings), ``seconds``, and the prior (``strength``, ``lambda``,
+        ``threshold_hu_per_mm``, ``p``, ``q``).
     """
     started = time.perf_counter()
     b, spacing, mu_per_hu = term.b, term.spacing, term.mu_per_hu

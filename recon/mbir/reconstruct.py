@@ -54,16 +54,14 @@ def reconstruct_mbir(
 
     Yields:
         Volumes in HU, batch by batch. Report: ``iterations``, ``fidelity``, ``residual`` (what is
-            left of the data at
-        the low frequencies that are the data's own, over what there was,
+        left of the data at the low frequencies that are the data's own, over what there was,
         :func:`recon.mbir.unrolled.low_residual`), ``chi2`` (weighted squared residual per reading),
         ``noise_scale_hu`` (of a whole field where 10 and 90 % of the voxels lie), ``voxel_mm`` (of
         the grid that is worked on), ``weights_sha256`` or the name of the ``prior``, of noisy scans
         ``residual_p`` (:mod:`torchpcct.metrics.residual_test`: does the volume explain its data?),
-        ``warnings``;
-        with something ``known``, under its name, whether it was drawn (``drawn``) or ``why`` not,
-        and where it was, ``drawn_minus_plain_hu``, the difference from the volume without drawing,
-        like the volume in HU.
+        ``warnings``; with something ``known``, under its name, whether it was drawn (``drawn``) or
+        ``why`` not, and where it was, ``drawn_minus_plain_hu``, the difference from the volume
+        without drawing, like the volume in HU.
 
     Raises:
         ValueError, TypeError: see :class:`recon.least_squares.inset_problem.InsetProblem`; an inset

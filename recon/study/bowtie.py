@@ -502,10 +502,9 @@ def _combined(
 
     Returns:
         JSON values of each exposure. Factors ``[value, low, high]`` in the paper's ROIs: of MBIR
-            with either bowtie
-        against FBP with the large one at equal exposure, and the second times the dose that the
-        bowtie saves (``product_…``); FBP's own ratio, with over without the ROI bowtie; MBIR's
-        contrast slope.
+        with either bowtie against FBP with the large one at equal exposure, and the second times
+        the dose that the bowtie saves (``product_…``); FBP's own ratio, with over without the ROI
+        bowtie; MBIR's contrast slope.
     """
     plain = read_task("plaque")
     scanners = {b: presets.pcct(views=s.plaque_views, bowtie=b) for b in BOWTIES}

@@ -121,8 +121,8 @@ def claim(records: list[dict[str, Any]]) -> dict[str, Any] | None:
 
     Returns:
         Both CNRs, the dose factor at 0.35 s, the one that is needed, and whether it is as large:
-            ``"yes"`` or ``"no"``
-        where the whole interval is, else ``"open"``; None where one of the two was not measured.
+        ``"yes"`` or ``"no"`` where the whole interval is, else ``"open"``; None where one of the
+        two was not measured.
     """
 
     def found(method: str, exposure_s: float, figure: str) -> Any:

@@ -308,10 +308,9 @@ def limits(series: list[PlaqueImage], tolerance: float) -> dict[str, Any]:
 
     Returns:
         ``cap``: blur at which the cap's thickness on the line has changed by ``tolerance``;
-            ``lumen``: the same of the
-        lumen's area; ``core_lost``: first blur of the series at which the core is not segmented
-        (None: at none);
-        ``basin``: blur at which the core's basin has half of its depth.
+        ``lumen``: the same of the lumen's area; ``core_lost``: first blur of the series at which
+        the core is not segmented (None: at none); ``basin``: blur at which the core's basin has
+        half of its depth.
     """
     sigmas, caps, areas, depths = (
         np.array([b[name] for b in series])

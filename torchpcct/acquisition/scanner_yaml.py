@@ -1,5 +1,7 @@
 """A scanner of one's own as YAML: geometry, tube, detector, filters, bowtie.
 
+A scanner with what may be said of it::
+
     name: bench                 # optional
     geometry:                   # of torchpcct.formats.geometry_yaml, kind cone; one turn of views
       {kind: cone, angles_deg: {step: 0.5, count: 720}, sod: 400, sdd: 800, columns: 640, rows: 32,

@@ -112,9 +112,8 @@ def centre_test(
 
     Returns:
         The test of ``centre``: how many columns too high the described positions of the columns
-            are; and of ``swing``,
-        the amplitude in columns by which it changes twice in a turn. :data:`UNKNOWN` where no
-        opposite rays were measured or nothing is to be seen.
+        are; and of ``swing``, the amplitude in columns by which it changes twice in a turn.
+        :data:`UNKNOWN` where no opposite rays were measured or nothing is to be seen.
 
     Raises:
         ValueError: a wrong shape, NaN or Inf.

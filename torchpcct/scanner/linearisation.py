@@ -205,7 +205,7 @@ class WaterLinearisation:
 
         Returns:
             Tensor of the shape, dtype and device of ``p``. NaN stays NaN. Not differentiable: see
-                :meth:`slope`.
+            :meth:`slope`.
 
         Raises:
             ValueError: a shape that does not fit the detector or the window.

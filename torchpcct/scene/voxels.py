@@ -87,9 +87,9 @@ class VoxelScene:
 
     Notes:
         With the scanner's own spectrum FBP of a polychromatic scan gives the numbers back: -1000 to
-            300 HU within 5 HU
-        (100 kVp silicon; rods of 20 mm in 200 mm of 0 HU; iodine 5.3). Denser matter hardens the
-        beam for itself and reads less, as in a patient. Read minus given, rod of 20 mm (10 mm):
+        300 HU within 5 HU (100 kVp silicon; rods of 20 mm in 200 mm of 0 HU; iodine 5.3). Denser
+        matter hardens the beam for itself and reads less, as in a patient. Read minus given, rod of
+        20 mm (10 mm):
 
         ======  =============  =============  ===========
         HU      bone           iodine         water

@@ -132,8 +132,7 @@ def calibration_costs(
 
     Returns:
         JSON values: ``cases``, one row per error (the first is none) with HU by energy and tissue,
-            contrast, Dice, and
-        their costs, the difference to the first.
+        contrast, Dice, and their costs, the difference to the first.
     """
     few = replace(s, views=s.calibration_views)
     # Fewer views stand for the paper's scan, thinned out: each sees as much of the gantry's turn.

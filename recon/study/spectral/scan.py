@@ -154,14 +154,13 @@ class SpectralScan:
 
         Returns:
             Line integrals ``(2, views, rows, columns)`` in mm, and how they scatter about the true
-            ones:
-            ``variance_ratio``: mean squared error of each component over its Cramér–Rao bound;
-                ``whitened_ratio``:
-            half of the mean squared error in the metric of the Fisher information, 1 at the bound;
-            ``bias``: mean error of each component in its standard deviations; ``zero_bins``: share
-            of the readings that counted nothing; ``rays``, ``at_bound``, ``failed``: numbers of
-            rays; ``rays_per_second``: by the clock, on ``threads`` threads;
-            ``rays_per_core_second``: of processor time, whatever else the machine does.
+            ones: ``variance_ratio``: mean squared error of each component over its Cramér–Rao
+            bound; ``whitened_ratio``: half of the mean squared error in the metric of the Fisher
+            information, 1 at the bound; ``bias``: mean error of each component in its standard
+            deviations; ``zero_bins``: share of the readings that counted nothing; ``rays``,
+            ``at_bound``, ``failed``: numbers of rays; ``rays_per_second``: by the clock, on
+            ``threads`` threads; ``rays_per_core_second``: of processor time, whatever else the
+            machine does.
         """
         clean, views = self.clean, slice(None, None, step)
         if step > 1:

@@ -87,8 +87,8 @@ def thorax(
 
     Returns:
         A scene of endless cylinders: ``"skin"``, ``"fat"``, ``"muscle"``, ``"lungs"``, ``"heart"``
-            and its chambers,
-        ``"rib_left_0"``… with ``"…_marrow"``, ``"vertebra"``, ``"sternum"`` and others.
+        and its chambers, ``"rib_left_0"``… with ``"…_marrow"``, ``"vertebra"``, ``"sternum"`` and
+        others.
 
     Raises:
         ValueError: unknown materials.
