@@ -83,8 +83,7 @@ def require_light(zero_fraction: float) -> None:
     if zero_fraction > _STARVED:
         raise ValueError(
             f"{100 * zero_fraction:.0f} % of the readings are zero: too few photons for a "
-            "line-integral method; "
-            "raise the exposure or bin the readings"
+            "line-integral method; raise the exposure or bin the readings"
         )
 
 

@@ -33,6 +33,6 @@ def metal_warnings(volume: Tensor) -> list[str]:
         return []
     return [
         f"the volume reaches {peak:.0f} HU, more than any tissue: metal hardens the beam and "
-        "starves the rays behind "
-        "it; streaks and shades beside it are no tissue, and are not corrected"
+        "starves the rays behind it; streaks and shades beside it are no tissue, and are not "
+        "corrected"
     ]

@@ -246,8 +246,7 @@ class ScanSlices:
         if outer:
             raise ValueError(
                 f"too many readings are dead near row {low + own.start}: slabs read {HALO} rows "
-                "beside their own, "
-                "which do not bridge them; reconstruct the whole volume at once"
+                "beside their own, which do not bridge them; reconstruct the whole volume at once"
             )
 
     def identity(self) -> str:
@@ -294,8 +293,7 @@ class SlabPlan:
         thick = max(stop - first for first, stop in self.slabs)
         return (
             f"{len(self.slabs)} slabs of up to {thick} slices, {self.memory / 1e9:.2f} GB of "
-            "memory, reads "
-            f"{self.read / 1e9:.2f} GB, writes {self.written / 1e9:.2f} GB, about "
+            f"memory, reads {self.read / 1e9:.2f} GB, writes {self.written / 1e9:.2f} GB, about "
             f"{self.seconds:.0f} s on one core"
         )
 
@@ -441,10 +439,9 @@ def plan_slabs(
     if most(thick) > limit:
         raise ValueError(
             f"memory={memory if memory is not None else limit} is too little: one slice at a time "
-            "needs "
-            f"{math.ceil(most(1) / 1e6)} MB ({base / 1e6:.0f} MB of them for the program itself): "
-            "give memory="
-            f"{math.ceil(most(1) / 1e6)}MB or more, bin the readings, or take larger voxels"
+            f"needs {math.ceil(most(1) / 1e6)} MB ({base / 1e6:.0f} MB of them for the program "
+            f"itself): give memory={math.ceil(most(1) / 1e6)}MB or more, bin the readings, or take "
+            "larger voxels"
         )
     slabs = tuple(cut(thick))
     bands = tuple(slab if fbp is None else fbp.band(*slab) for slab in slabs)
@@ -755,8 +752,7 @@ def _looked_at(
         texts.insert(
             0,
             f"{replaced} readings are such as no object can cause (dead cells, wrong gains, lost "
-            "readings): "
-            f"{share:.2g} % of the readings were interpolated from their neighbours",
+            f"readings): {share:.2g} % of the readings were interpolated from their neighbours",
         )
     if any(sides) and not any("inside the object" in text for text in texts):
         texts.append(

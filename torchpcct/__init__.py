@@ -66,8 +66,7 @@ def _check_cache(folder: str, home: str) -> None:
 
     warnings.warn(
         f"numba can keep compiled kernels neither in {folder} nor in {home}: set NUMBA_CACHE_DIR "
-        "to a folder that you "
-        "can write",
+        "to a folder that you can write",
         RuntimeWarning,
         stacklevel=2,
     )

@@ -305,8 +305,7 @@ def _drawn(kernel: Any, readings: tuple[Tensor, ...], first_index: Any, *paramet
         if values.shape != like.shape or values.dtype != like.dtype or not values.ndim:
             raise ValueError(
                 f"readings must have one shape (..., n) and one dtype, got {tuple(values.shape)} "
-                f"{values.dtype} beside "
-                f"{tuple(like.shape)} {like.dtype}"
+                f"{values.dtype} beside {tuple(like.shape)} {like.dtype}"
             )
     shape = like.shape
     rows = [values.detach().cpu().contiguous().reshape(-1, shape[-1]) for values in readings]

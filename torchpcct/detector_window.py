@@ -224,8 +224,7 @@ def footprint(
         if depth.min() <= 0:
             raise ValueError(
                 f"the grid reaches {grid.in_plane_radius:.1f} mm from the axis, beyond the source "
-                "orbit "
-                f"(sod {geometry.sod} mm): move or shrink the grid"
+                f"orbit (sod {geometry.sod} mm): move or shrink the grid"
             )
         if geometry.detector == "curved":
             position = geometry.sdd * np.arctan2(across, depth)
@@ -250,8 +249,7 @@ def footprint(
             if row1 < 0.0 or row0 > geometry.rows - 1:
                 raise ValueError(
                     f"the grid (z = {reach[0]:g} … {reach[1]:g} mm) lies above or below all "
-                    f"{geometry.rows} rows in "
-                    "every view: move it along z"
+                    f"{geometry.rows} rows in every view: move it along z"
                 )
             first_row = int(np.clip(math.floor(row0), 0, geometry.rows - 1))
             rows = int(np.clip(math.ceil(row1), first_row, geometry.rows - 1)) - first_row + 1
@@ -260,8 +258,8 @@ def footprint(
     if low.min() < -0.5 - 1e-9 or high.max() > geometry.columns - 0.5 + 1e-9:
         raise ValueError(
             f"the grid (centre x {cx:g}, y {cy:g} mm, {grid.extent[-1]:g} × {grid.extent[-2]:g} "
-            "mm) leaves the field "
-            f"of view of {geometry.columns} columns in some views: move or shrink it"
+            f"mm) leaves the field of view of {geometry.columns} columns in some views: move or "
+            "shrink it"
         )
     first = np.floor(low + 0.5 - 1e-9).astype(np.int64) - margin
     last = np.ceil(high - 0.5 + 1e-9).astype(np.int64) + margin

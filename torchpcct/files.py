@@ -387,8 +387,7 @@ def _check_seal(path: str | os.PathLike[str], kind: str) -> None:
     if head != (_MAGIC + digest.encode() + b"\n").ljust(_BLOCK, b"\0"):
         raise ValueError(
             f"{path} is truncated or damaged: its content does not have the checksum that it was "
-            "written with; take "
-            "another copy of it, or make it again"
+            "written with; take another copy of it, or make it again"
         )
 
 

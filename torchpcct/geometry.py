@@ -76,8 +76,8 @@ def _angles(value: Any) -> Floats:
     if np.ptp(angles) > _DEGREES_SPAN_RAD and view_step(angles) > _DEGREES_STEP_RAD:
         warnings.warn(
             f"the angles cover {np.ptp(angles) / (2 * math.pi):.0f} turns in steps of "
-            f"{view_step(angles):.3g} rad: "
-            "they look like degrees; give rad (numpy.deg2rad), or angles modulo 2π if they are rad",
+            f"{view_step(angles):.3g} rad: they look like degrees; give rad (numpy.deg2rad), or "
+            "angles modulo 2π if they are rad",
             UserWarning,
             stacklevel=4,
         )
@@ -313,8 +313,8 @@ class _Divergent(Geometry):
         set_(self, "columns", whole("columns", self.columns))
         if self.sdd <= self.sod:
             raise ValueError(
-                f"sdd ({self.sdd} mm) must be greater than sod ({self.sod} mm): "
-                "sdd is the distance from the source to the detector, not from the isocentre"
+                f"sdd ({self.sdd} mm) must be greater than sod ({self.sod} mm): sdd is the "
+                "distance from the source to the detector, not from the isocentre"
             )
         choice("detector", self.detector, ("flat", "curved"))
 
@@ -325,8 +325,8 @@ class _Divergent(Geometry):
             if half >= math.pi / 2:
                 raise ValueError(
                     f"a curved detector of {self.columns} columns × {pitch} mm at sdd {self.sdd} "
-                    "mm spans a half-fan "
-                    f"of {math.degrees(half):.1f}°, 90° or more: reduce columns or pitch"
+                    f"mm spans a half-fan of {math.degrees(half):.1f}°, 90° or more: reduce "
+                    "columns or pitch"
                 )
 
     @property

@@ -112,8 +112,7 @@ def announce_compilation() -> None:
                 Announce.announced = True
                 logging.getLogger(__name__).warning(
                     "compiling kernels for this processor: this call takes up to a minute longer, "
-                    "later ones read them "
-                    "from numba's cache"
+                    "later ones read them from numba's cache"
                 )
 
         def on_end(self, event: Any) -> None:

@@ -313,8 +313,7 @@ def logged(
     if high > _HIGHEST or low < -_HIGHEST:
         raise ValueError(
             f"lines reach from {low:g} to {high:g}, no line integrals (−ln of the transmission): "
-            "are they counts, "
-            "percentages or HU? Use from_counts for readings"
+            "are they counts, percentages or HU? Use from_counts for readings"
         )
     estimated = photons is None
     air = (
@@ -513,8 +512,8 @@ def bridge(lines: Tensor, dead: Tensor, rows: bool, most: float = MOST_DEAD) -> 
         worst = torch.unravel_index(share.argmax(), share.shape)
         raise ValueError(
             f"{100 * float(share.max()):.0f} % of the readings of view {int(worst[-1])} are dead "
-            "(NaN, Inf or masked), "
-            f"at most {100 * most:.0f} % can be bridged: leave bad views out with geometry.select"
+            f"(NaN, Inf or masked), at most {100 * most:.0f} % can be bridged: leave bad views out "
+            "with geometry.select"
         )
     if bool(dead.all()):
         raise ValueError("no live reading is left: the scan cannot be used")

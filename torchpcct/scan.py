@@ -290,8 +290,7 @@ class Scan:
         if self.logged and self.info.get("photons") != "given":
             raise ValueError(
                 "these are line integrals of an unknown number of photons: give photons= where "
-                "the scan is made, or "
-                "the raw counts"
+                "the scan is made, or the raw counts"
             )
         self._require_noise_model()
         readings = noise.thinned(
@@ -384,8 +383,7 @@ class Scan:
         if not self.counting and self.quantum is None:
             raise ValueError(
                 "this energy-integrating scan does not hold the energy of its quanta, so its "
-                "noise is not known: "
-                "simulate it with acquire(), or give quantum="
+                "noise is not known: simulate it with acquire(), or give quantum="
             )
 
     def relative_variance(self, exposure_s: float) -> Tensor:

@@ -175,8 +175,7 @@ def slice_axis(geometry: Geometry, shape: tuple[int, ...], window: Any = None) -
         kind = "part of a detector (a region)" if window is not None else type(geometry).__name__
         raise NoSlicesError(
             "slices= picks slices of parallel and fan beams or rows of a cone beam, this is one "
-            f"{kind} of "
-            f"{len(shape)} axes"
+            f"{kind} of {len(shape)} axes"
         )
     return 1 if geometry.has_rows else 0
 

@@ -75,9 +75,8 @@ class VectorGeometry(Geometry):
         bad = volume <= 1e-9 * sizes[0] * sizes[1] * sizes[2]
         if bad.any():
             raise ValueError(
-                f"the rays of view {int(bad.argmax())} do not meet their detector, or meet it "
-                "edge on: are its vectors "
-                "in the order source, centre, u, v?"
+                f"the rays of view {int(bad.argmax())} do not meet their detector, or meet it edge "
+                "on: are its vectors in the order source, centre, u, v?"
             )
 
     @property

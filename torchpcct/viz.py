@@ -139,8 +139,8 @@ def viewer_page(volumes: Sequence[tuple[str, Volume, float, float]], title: str)
     if voxels > _MOST_VOXELS:
         raise ValueError(
             f"{voxels / 1e6:.0f} million voxels are too many for one page (at most "
-            f"{_MOST_VOXELS / 1e6:.0f} million): "
-            "show fewer volumes, or reconstruct a smaller extent or larger voxels"
+            f"{_MOST_VOXELS / 1e6:.0f} million): show fewer volumes, or reconstruct a smaller "
+            "extent or larger voxels"
         )
     about, data = [], []
     for number, (label, volume, level, width) in enumerate(volumes):

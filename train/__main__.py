@@ -92,16 +92,14 @@ def _parser() -> Parser:
             Path,
             "PATH",
             "folder of what the network sees of the scenes, several GB; runs of one seed and the "
-            "same data share it "
-            "(default: the folder views in --out)",
+            "same data share it (default: the folder views in --out)",
         ),
         (
             "--painters",
             int,
             "N",
             "processes that make all views beforehand (default: each is made when it is first "
-            "used; needed for the "
-            "speed of a GPU)",
+            "used; needed for the speed of a GPU)",
             {"limits": {"high": MOST}},
         ),
         ("--no-progress", bool, None, "no progress line"),
@@ -225,8 +223,7 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
             if "class" in config.network:
                 raise ValueError(
                     f"the run in {arguments.out} trains {config.network['class']}, which no file "
-                    "alone may import: if "
-                    "you trust it, name its configuration, --config "
+                    "alone may import: if you trust it, name its configuration, --config "
                     f"{shlex.quote(str(arguments.out / 'config.yaml'))}"
                 )
         else:
@@ -273,8 +270,7 @@ def _run(arguments: argparse.Namespace, command: str) -> int:
     score = f"{state.best['score']:.5g}" if state.best else "none"
     print(
         f"{state.step} steps in {state.seconds / 60:.1f} min{skipped}; best validation score "
-        f"{score}; "
-        f"weights and card in {arguments.out}"
+        f"{score}; weights and card in {arguments.out}"
     )
     return 0
 

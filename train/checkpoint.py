@@ -92,9 +92,8 @@ def start_from(model: nn.Module, tensors: Mapping[str, Tensor]) -> None:
             shape = "none" if old is None else tuple(old.shape)
             raise ValueError(
                 f"the weights to start from do not fit into this network: {name} has the shape "
-                f"{shape} there, "
-                f"{tuple(value.shape)} here; name a configuration whose network is the same or "
-                "wider"
+                f"{shape} there, {tuple(value.shape)} here; name a configuration whose network is "
+                "the same or wider"
             )
         if value.dim() > 1:
             value[: old.shape[0], old.shape[1] :] = 0.0

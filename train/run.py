@@ -186,8 +186,7 @@ class Run:
         if other:
             raise ValueError(
                 f"the run in {self.out} has another configuration ({', '.join(sorted(other))}): "
-                "resume it unchanged, "
-                "or start a new run from its weights"
+                "resume it unchanged, or start a new run from its weights"
             )
         moments: dict[int, dict[str, Tensor]] = {}
         for key, value in _part(tensors, "adam").items():
@@ -237,11 +236,9 @@ class Run:
             )
         if state.bad >= PATIENCE:
             raise DivergedError(
-                f"the loss or its gradient was not finite in {PATIENCE} steps in a row, up to "
-                f"step {state.step}: "
-                f"the weights have not changed since step {state.step - state.bad}; try a smaller "
-                "learning rate than "
-                f"{config.learning_rate:g}"
+                f"the loss or its gradient was not finite in {PATIENCE} steps in a row, up to step "
+                f"{state.step}: the weights have not changed since step {state.step - state.bad}; "
+                f"try a smaller learning rate than {config.learning_rate:g}"
             )
 
     def validate(self, held_out: Data, objective: Objective) -> None:

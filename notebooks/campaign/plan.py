@@ -72,11 +72,9 @@ def main() -> None:
         "| | |",
         "|---|---|",
         f"| a realisation, all methods, one core | {realisation:.1f} s (draws {draw:.1f} s, a "
-        f"volume {volume:.2f} s on "
-        "average) |",
+        f"volume {volume:.2f} s on average) |",
         f"| all of it | {total / 3600:,.0f} core hours, {total / 3600 * EUROS_PER_CORE_HOUR:,.0f} "
-        "€ at "
-        f"{EUROS_PER_CORE_HOUR} € a core hour |",
+        f"€ at {EUROS_PER_CORE_HOUR} € a core hour |",
         f"| kept | {TASKS * METHODS * DRAWS * m['bytes_realisation'] / 1e12:.2f} TB of pieces, and "
         f"{TASKS * m['bytes_scans'] / 1e12:.2f} TB of noise-free scans |",
         f"| network, disk not shared | the pieces once, and {m['bytes_job'] / 1e3:.0f} kB of "
@@ -86,10 +84,8 @@ def main() -> None:
         "## Block size and workers",
         "",
         "Realisations of a piece are computed by one job for all methods. Share of the workers' "
-        "time that computes, "
-        f"simulated; {100 * SLOW_SHARE:g} % of the nodes are {SLOW:g} times slower, "
-        f"{DEATHS_PER_HOUR:g} deaths a "
-        "worker and hour:",
+        f"time that computes, simulated; {100 * SLOW_SHARE:g} % of the nodes are {SLOW:g} times "
+        f"slower, {DEATHS_PER_HOUR:g} deaths a worker and hour:",
         "",
         "| block | jobs | a job | files | " + " | ".join(f"{w} workers" for w in WORKERS) + " |",
         "|---|" + "---|" * (3 + len(WORKERS)),
@@ -119,26 +115,20 @@ def main() -> None:
         "## What breaks first",
         "",
         "1. Stragglers: a run ends with the last job of a slow node, so jobs must be short beside "
-        "a run's share of a "
-        "worker. This is what the table shows, and it forbids large blocks long before anything "
-        "asks for them.",
-        f"2. The result store: blocks of 8 make {files:,} files, where parallel file systems "
-        "allow some 10⁶ to 10⁷ "
-        "a user; to see which are there takes a repeated command "
-        f"{files * m['seconds_has'] / 3600:.1f} h. Hence runs "
-        f"of {TASKS // PARTS} tasks, each folder packed or cleared when its report stands; blocks "
-        "of 40 where "
-        "stragglers allow.",
+        "a run's share of a worker. This is what the table shows, and it forbids large blocks "
+        "long before anything asks for them.",
+        f"2. The result store: blocks of 8 make {files:,} files, where parallel file systems allow "
+        "some 10⁶ to 10⁷ a user; to see which are there takes a repeated command "
+        f"{files * m['seconds_has'] / 3600:.1f} h. Hence runs of {TASKS // PARTS} tasks, each "
+        "folder packed or cleared when its report stands; blocks of 40 where stragglers allow.",
         f"3. The client's memory: about {m['client_bytes_job'] / 1e3:.1f} kB a job, "
         f"{m['client_bytes_job'] * TASKS * DRAWS / 8 / 1e9:.1f} GB for all tasks at once in "
         "blocks of 8.",
         f"4. The scheduler, last: {1e3 * m['seconds_per_job']:.1f} ms of client a job, {rate:.0f} "
-        "jobs a second, feed "
-        f"{rate * 8 * realisation:,.0f} workers with blocks of 8.",
+        f"jobs a second, feed {rate * 8 * realisation:,.0f} workers with blocks of 8.",
         "",
         "So the block of `recon/evaluate/measure.py` stays at 8; what a campaign of this size "
-        "lacks is a store "
-        "that packs the pieces of a task into few files.",
+        "lacks is a store that packs the pieces of a task into few files.",
         "",
     ]
     (HERE / "plan.md").write_text("\n".join(lines), encoding="utf-8")

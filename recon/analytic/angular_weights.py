@@ -69,8 +69,7 @@ def check_gaps(angles: Floats, period: float = 2.0 * math.pi) -> None:
     if inner > OPEN_GAP_STEPS * usual:
         lacking = (
             f"views lack inside of the scan: besides its end a gap of {math.degrees(inner):.2f}° "
-            "where the usual step "
-            f"is {math.degrees(usual):.2f}°"
+            f"where the usual step is {math.degrees(usual):.2f}°"
         )
         if inner > INNER_GAP_RAD:
             raise ValueError(

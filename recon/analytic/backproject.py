@@ -99,8 +99,7 @@ class BackprojectionPlan:
         if self.kind != 0 and grid.in_plane_radius + self.travel >= self.sod:
             raise ValueError(
                 f"the grid reaches {grid.in_plane_radius + self.travel:.1f} mm from the axis, "
-                "beyond the source orbit "
-                f"(sod {self.sod} mm): move or shrink the grid"
+                f"beyond the source orbit (sod {self.sod} mm): move or shrink the grid"
             )
         self.scale = 1.0 / pitch
         first = geometry.column_positions[0]
@@ -127,8 +126,7 @@ class BackprojectionPlan:
         if abs(cy) > half_y or abs(cx) > half_x or outside.all():
             raise ValueError(
                 f"the grid (centre x {cx:g}, y {cy:g} mm, {2 * half_x:g} × {2 * half_y:g} mm) "
-                "leaves the field of view "
-                f"of radius {self.radius:.2f} mm: move or shrink it"
+                f"leaves the field of view of radius {self.radius:.2f} mm: move or shrink it"
             )
         return outside
 
@@ -181,8 +179,7 @@ class BackprojectionPlan:
             if short:
                 raise ValueError(
                     f"the window's rows {w.first_row}…{w.first_row + w.rows - 1} do not cover the "
-                    "grid: "
-                    "use torchpcct.detector_window.footprint(geometry, grid, margin=1, "
+                    "grid: use torchpcct.detector_window.footprint(geometry, grid, margin=1, "
                     "motion=motion)"
                 )
 

@@ -78,10 +78,9 @@ def refuse_helix(geometry: Geometry, motion: Any) -> None:
         return
     if np.corrcoef(z, geometry.angles)[0, 1] ** 2 > _STEADY:
         raise ValueError(
-            f"the table travels by {np.ptp(z):.2f} mm, the rows cover {height:.2f} mm at the "
-            "axis: filtered "
-            "backprojection of a helix is not provided. Use recon.pwls with Projector(geometry, "
-            "grid, motion=motion)"
+            f"the table travels by {np.ptp(z):.2f} mm, the rows cover {height:.2f} mm at the axis: "
+            "filtered backprojection of a helix is not provided. Use recon.pwls with "
+            "Projector(geometry, grid, motion=motion)"
         )
 
 
@@ -143,8 +142,7 @@ def check_rows(geometry: Geometry, grid: VolumeGrid, motion: Any = None) -> list
             out = z[~seen]
             found.append(
                 f"{out.size} of {z.size} slices (z = {out.min():g} … {out.max():g} mm) {how} and "
-                "are extrapolated: "
-                f"{reach}"
+                f"are extrapolated: {reach}"
             )
     return found
 
@@ -165,8 +163,7 @@ def view_notes(geometry: Geometry) -> list[str]:
     how = ", mirrored" if turn < 4.0 else ""
     return [
         f"the views reach from {math.degrees(first):.5g}° to {math.degrees(last):.5g}°, both ends "
-        "included: the last "
-        f"repeats the first{how}, and the two share one step of "
+        f"included: the last repeats the first{how}, and the two share one step of "
         f"{math.degrees(view_step(geometry.angles)):.3g}°"
     ]
 
@@ -190,11 +187,9 @@ def sampling_warnings(geometry: Geometry) -> list[str]:
         return []
     needed = math.ceil(2 * math.pi * radius / (STREAK_CELLS * cell))
     return [
-        f"{geometry.views} views are few: at the border of the field of view ({radius:.0f} mm) "
-        "the paths of "
-        f"neighbouring views lie {apart:.1f} mm apart, {apart / cell:.0f} cells: edges there draw "
-        "streaks; "
-        f"{needed} views a turn would keep them below {STREAK_CELLS:g} cells"
+        f"{geometry.views} views are few: at the border of the field of view ({radius:.0f} mm) the "
+        f"paths of neighbouring views lie {apart:.1f} mm apart, {apart / cell:.0f} cells: edges "
+        f"there draw streaks; {needed} views a turn would keep them below {STREAK_CELLS:g} cells"
     ]
 
 
@@ -329,10 +324,9 @@ def _water_texts(lines: Any, geometry: Any, mu_water: float) -> list[str]:
         return []
     return [
         f"water of mu_water = {mu_water:.3g} mm⁻¹ as thick as the object ({across:.3g} mm) would "
-        "have a line integral "
-        f"of {black:.2g}, the densest here is {found:.2g}: all reads about "
-        f"{1000 * (found / black - 1):.0f} HU; is "
-        f"mu_water given in cm⁻¹? {mu_water:.3g} cm⁻¹ are {mu_water / 10:.3g} mm⁻¹"
+        f"have a line integral of {black:.2g}, the densest here is {found:.2g}: all reads about "
+        f"{1000 * (found / black - 1):.0f} HU; is mu_water given in cm⁻¹? {mu_water:.3g} cm⁻¹ are "
+        f"{mu_water / 10:.3g} mm⁻¹"
     ]
 
 
@@ -374,19 +368,16 @@ def _surround_texts(scan: Scan) -> list[str]:
             size = 100.0 * np.mean([np.quantile(sign * ratio, 0.7) for ratio, _ in off])
             found.append(
                 f"beside the inset the readings of a third of the views or more lie {size:.2g} % "
-                f"{side} those of the "
-                "known surround: they hold something else than the transmission (a dark signal, "
-                "scatter, pile-up, "
-                "saturation), or exposure or surround are not those of the scan; values are off "
-                "by a smooth background"
+                f"{side} those of the known surround: they hold something else than the "
+                "transmission (a dark signal, scatter, pile-up, saturation), or exposure or "
+                "surround are not those of the scan; values are off by a smooth background"
             )
     gain = _gain_spread(lines, window.column_indices)
     if gain > _GAIN_TOLERANCE:
         found.append(
             "the cells of the detector differ from their neighbours in the next rows by "
-            f"{100 * gain:.2g} % in all "
-            "their views (standard deviation): gains that the calibration in air did not see, "
-            "which draw rings"
+            f"{100 * gain:.2g} % in all their views (standard deviation): gains that the "
+            "calibration in air did not see, which draw rings"
         )
     return found
 
@@ -455,16 +446,12 @@ def _cut_text(lines: Any, sides: tuple[bool, bool]) -> str:
     if all(sides) and all(float(end.std()) < _EVEN * level for end in ends):
         return (
             f"no row ends in air: its line integrals are {level:.2g} at both ends in all views "
-            "alike: air is "
-            f"{math.exp(level):.2g} times too bright (measured with another exposure or gain, or "
-            "readings saturate), "
-            "or the object reaches beyond the detector all around"
+            f"alike: air is {math.exp(level):.2g} times too bright (measured with another exposure "
+            "or gain, or readings saturate), or the object reaches beyond the detector all around"
         )
     where = " and the ".join(name for name, cut in (("first", sides[0]), ("last", sides[1])) if cut)
     return (
         f"the rows end inside the object at the {where} column (line integrals of {level:.2g} on "
-        "average there): what "
-        "lies beyond is not known, so values are off by a smooth background, most near the edge "
-        "of the field of view; "
-        "differences between neighbours are not"
+        "average there): what lies beyond is not known, so values are off by a smooth background, "
+        "most near the edge of the field of view; differences between neighbours are not"
     )

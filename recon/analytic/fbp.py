@@ -154,8 +154,8 @@ def _check_opposites(geometry: Beam) -> None:
     if abs(quarters - 0.25) > 0.1:
         raise ValueError(
             f"interleave needs columns a quarter pitch beside the axis, offset {offset:g} mm at a "
-            f"pitch of {pitch:g} "
-            "mm leaves opposite rays on one another: filter the sinogram as it is"
+            f"pitch of {pitch:g} mm leaves opposite rays on one another: filter the sinogram as it "
+            "is"
         )
     _, _, span = view_steps(geometry.angles)
     if span < 2.0 * math.pi:
@@ -168,8 +168,7 @@ def _check_opposites(geometry: Beam) -> None:
     if radius < field / 4.0:
         _LOG.warning(
             "interleave: with %d views aliasing cancels only within %.1f mm of the axis: use more "
-            "views, or filter the "
-            "sinogram as it is",
+            "views, or filter the sinogram as it is",
             geometry.views,
             radius,
         )
@@ -381,9 +380,8 @@ def _without_dead(sinogram: Tensor, geometry: Geometry) -> Tensor:
         return sinogram
     dead = ~torch.isfinite(sinogram.detach())
     warnings.warn(
-        f"{int(dead.sum())} of {dead.numel()} readings are NaN or Inf: they are taken for dead "
-        "and bridged by their "
-        "neighbours",
+        f"{int(dead.sum())} of {dead.numel()} readings are NaN or Inf: they are taken for dead and "
+        "bridged by their neighbours",
         UserWarning,
         stacklevel=4,
     )
@@ -398,9 +396,8 @@ def _completed(rows: Rows, grid: VolumeGrid, motion: Any, outside: float | None)
         if any(sides) and outside is None:
             warnings.warn(
                 "the rows end inside the object at the "
-                f"{' and the '.join(_SIDES[i] for i in (0, 1) if sides[i])} "
-                "column: CT numbers will be wrong, most near the edge of the field of view; pass "
-                "outside= the "
+                f"{' and the '.join(_SIDES[i] for i in (0, 1) if sides[i])} column: CT numbers "
+                "will be wrong, most near the edge of the field of view; pass outside= the "
                 "attenuation in mm⁻¹ of what lies beyond (0 to do without)",
                 UserWarning,
                 stacklevel=4,

@@ -69,9 +69,8 @@ class FilterPlan:
         if b.first_row < a.first_row or b.first_row + b.rows > a.first_row + a.rows:
             raise ValueError(
                 f"the window to fill has rows {b.first_row}…{b.first_row + b.rows - 1}, but the "
-                "data only rows "
-                f"{a.first_row}…{a.first_row + a.rows - 1}: filtering needs every row that it "
-                "returns"
+                f"data only rows {a.first_row}…{a.first_row + a.rows - 1}: filtering needs every "
+                "row that it returns"
             )
         if isinstance(g, ParallelBeam):
             pitch, curved = g.column_pitch, False

@@ -111,8 +111,7 @@ def require_same_surround(scan: Scan, lines: Tensor) -> None:
     if own.shape != lines.shape or not float((own - lines.to(own)).abs().max()) <= SAME_SURROUND:
         raise ValueError(
             "this scan has another surround (or water correction) than the scan that this was "
-            "made for: reconstruct "
-            "scans of different objects or scanners one by one"
+            "made for: reconstruct scans of different objects or scanners one by one"
         )
 
 

@@ -263,10 +263,8 @@ def add_view(commands: Commands) -> None:
         _view,
         "volumes in a page for the browser, or a slice as a picture",
         "Draw a slice of a volume, or, with --html, make a page that shows volumes side by side "
-        "in any "
-        "browser: three planes, wheel through the slices, window by dragging, one cursor in all "
-        "volumes, values and "
-        "ROIs. The page is one file and needs no network.",
+        "in any browser: three planes, wheel through the slices, window by dragging, one cursor "
+        "in all volumes, values and ROIs. The page is one file and needs no network.",
         "torchpcct view fbp.nii.gz mbir.nii.gz --level 150 --window 600 --html view.html",
         "torchpcct view mbir.nii.gz --plane x --slice 18 --out sagittal.png",
     )

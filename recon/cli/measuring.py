@@ -271,8 +271,8 @@ def _volumes(arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], str, 
     if reference not in names:
         raise ValueError(
             f"{first} and {second} hold {', '.join(names) or 'no volumes of one name'}: "
-            "--reference names the one of a "
-            "linear method that has smoothed nothing (FBP, kernel ram-lak)"
+            "--reference names the one of a linear method that has smoothed nothing (FBP, kernel "
+            "ram-lak)"
         )
     pairs = {name: [Volume.load(s[name]) for s in stems] for name in names}
     grid, unit = pairs[reference][0].grid, pairs[reference][0].unit
@@ -469,12 +469,10 @@ def add_evaluate(commands: Commands) -> None:
         _evaluate,
         "how much dose does a method save at a task?",
         "Measure reconstruction methods, yours too, at tasks, ready or yours, on the same noise "
-        "realisations: dose "
-        "factors with intervals beside the limit of the data, noise, error, contrast, "
-        "detectability, pictures. "
-        "Finished pieces are kept in the folder: the same command goes on after an interruption, "
-        "and a second one with "
-        "more methods computes only those.",
+        "realisations: dose factors with intervals beside the limit of the data, noise, error, "
+        "contrast, detectability, pictures. Finished pieces are kept in the folder: the same "
+        "command goes on after an interruption, and a second one with more methods computes only "
+        "those.",
         "torchpcct evaluate --task nodule --method mbir --n 20",
         "torchpcct evaluate --task my.yaml --method mylab.nets:reconstruct --denoiser "
         "mylab.nets:denoise@fbp:detail",
@@ -555,10 +553,8 @@ def add_dose_factor(commands: Commands) -> None:
         _evaluate,
         "the whole measurement: every method of the package at every plaque task",
         "evaluate with the methods of this package, the simple filters among them, at the paper's "
-        "plaque, its "
-        "variants, vessels of other directions, a sphere in muscle, line pairs and a low-contrast "
-        "rod, with 200 "
-        "realisations: hours on two cores, kept piece by piece.",
+        "plaque, its variants, vessels of other directions, a sphere in muscle, line pairs and a "
+        "low-contrast rod, with 200 realisations: hours on two cores, kept piece by piece.",
         "torchpcct dose-factor --task plaque --method mbir --method fbp:soft --n 40",
         before=_METHODS_TEXT,
         out="folder for report.md, .json, .csv, .html and pictures (default out/dose-factor)",
@@ -618,10 +614,8 @@ def add_compare(commands: Commands) -> None:
         _own_study,
         registry.STUDIES["compare"],
         "Simulate the paper's plaque scan at full size, reconstruct it by FBP, PWLS, the best "
-        "simple filter and MBIR "
-        "on the same noise realisations at 1× and 5.7× dose, and print what dose each saves. "
-        "After an interruption the "
-        "same command goes on.",
+        "simple filter and MBIR on the same noise realisations at 1× and 5.7× dose, and print "
+        "what dose each saves. After an interruption the same command goes on.",
         "torchpcct compare --quick",
         "torchpcct compare --n 200 --methods fbp:soft pwls mbir:fidelity=1",
         out="folder for report.html, .md, .json and two pictures (default out/compare)",
@@ -642,8 +636,7 @@ def add_hardcases(commands: Commands) -> None:
         _own_study,
         registry.STUDIES["hardcases"],
         "Break the plaque's scan in many ways, reconstruct what is left by every method, and "
-        "print the error, what was "
-        "said, and whether it was wrong without a warning.",
+        "print the error, what was said, and whether it was wrong without a warning.",
         "torchpcct hardcases --quick",
         "torchpcct hardcases --methods fbp pwls --views 246",
         out="folder for report.html, .md, .json and the figure (default out/hardcases)",
@@ -672,8 +665,7 @@ def add_study(commands: Commands) -> None:
         _study,
         "any study of the paper by its name; torchpcct study --help lists them",
         "Run a study of the paper at full scale and print its figures beside the published ones. "
-        "After an interruption "
-        "the same command goes on.",
+        "After an interruption the same command goes on.",
         "torchpcct study noise --quick",
         "torchpcct study motion --set thinning=4",
         before=f"studies:\n{listed}\n",
@@ -696,8 +688,7 @@ def add_verify(commands: Commands) -> None:
         _verify,
         "do README and RESULTS.md say what the committed reports say?",
         "Render the results again from the committed reports (notebooks/results.template.md) and "
-        "compare; "
-        "compute studies again if asked.",
+        "compare; compute studies again if asked.",
         "torchpcct verify --write",
         "torchpcct verify --again phantom",
     )

@@ -572,8 +572,7 @@ def check_results(
     if there and not is_own(_json(folder / "report.json")) and not arguments.force:
         raise ValueError(
             f"{folder} holds {', '.join(there[:3])}{' …' if there[3:] else ''}, not made by "
-            "torchpcct "
-            f"{arguments.command}: name another folder, or --force"
+            f"torchpcct {arguments.command}: name another folder, or --force"
         )
 
 

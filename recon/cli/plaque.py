@@ -41,8 +41,7 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     if scan.window is None and (arguments.center is None or arguments.extent is None):
         raise ValueError(
             f"{arguments.scan} holds the whole detector, and a vessel is read in a small inset: "
-            "--center Z Y X and "
-            "--extent Z Y X say which"
+            "--center Z Y X and --extent Z Y X say which"
         )
     grid = VolumeGrid.of(
         scan, voxel=arguments.voxel, extent=arguments.extent, center=arguments.center

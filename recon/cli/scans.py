@@ -206,8 +206,8 @@ def add_simulate(commands: Commands) -> None:
         _simulate,
         "simulate a scan to an HDF5 file",
         "Simulate a scan of any scene (--config, see show-config) or, without one, of the paper's "
-        "plaque by the "
-        "deep-silicon PCCT, and write it to HDF5, with what was done beside (.json, .yaml).",
+        "plaque by the deep-silicon PCCT, and write it to HDF5, with what was done beside (.json, "
+        ".yaml).",
         "torchpcct simulate --exposure 2 --out plaque.h5",
         "torchpcct show-config > scene.yaml; torchpcct simulate --config scene.yaml --out scan.h5",
         out="HDF5 file to write",
@@ -335,8 +335,8 @@ def _add_reader_options(parser: Parser, many: bool = False) -> None:
             "--angles-deg",
             _angles,
             "FILE|START:STEP",
-            "angles of Data Exchange and NeXus in degrees: a text file with "
-            "one a line, or the first and their step",
+            "angles of Data Exchange and NeXus in degrees: a text file with one a line, or the "
+            "first and their step",
         ),
         (
             "--air",
@@ -442,8 +442,7 @@ def _require_voxels(shape: tuple[int, ...]) -> None:
     if math.prod(shape) > MOST_VOXELS:
         raise ValueError(
             f"--voxel makes {' × '.join(map(str, shape))} voxels, more than {MOST_VOXELS:.0e}: "
-            "enlarge the voxels, or "
-            "reconstruct a smaller --extent"
+            "enlarge the voxels, or reconstruct a smaller --extent"
         )
 
 
@@ -685,9 +684,8 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
             return
         print(yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
         print(
-            f"{arguments.out}: "
-            f"about {bytes_ / 2**30:.2f} GiB; FBP about {seconds:.1f} s on one core, iterative "
-            "methods many times that"
+            f"{arguments.out}: about {bytes_ / 2**30:.2f} GiB; FBP about {seconds:.1f} s on one "
+            "core, iterative methods many times that"
         )
         return
     if "weights" in options:
@@ -819,8 +817,7 @@ def add_reconstruct(commands: Commands) -> None:
         _reconstruct,
         "reconstruct a scan file to a volume",
         "Reconstruct a scan, ours or a foreign one, and write the volume, with what was done "
-        "beside (.json, .yaml). "
-        "Many scans go into a folder, each SCAN_METHOD.nii.gz.",
+        "beside (.json, .yaml). Many scans go into a folder, each SCAN_METHOD.nii.gz.",
         "torchpcct reconstruct tooth.h5 --find-axis --out tooth.nii.gz",
         "torchpcct reconstruct scan.h5 --method mbir --fidelity 1 --out mbir.nii.gz",
         "torchpcct reconstruct scans/*.h5 --out volumes --workers 4",
@@ -836,8 +833,7 @@ def add_reconstruct(commands: Commands) -> None:
             str,
             None,
             "fbp, pwls or mbir (default fbp); with options as evaluate has them: "
-            "mbir:prior=perona-malik, or "
-            "mbir:prior=package.module:function in the network's place",
+            "mbir:prior=perona-malik, or mbir:prior=package.module:function in the network's place",
             {"default": "fbp"},
         ),
         (
@@ -976,10 +972,8 @@ def add_lower_dose(commands: Commands) -> None:
         _lower_dose,
         "a measured scan as if it had been taken with less dose",
         "Write a scan, ours or a foreign one, as it would have been at a fraction of its dose, "
-        "noise included. Photon "
-        "counts are thinned, which is exact; other readings get the right mean and variance. "
-        "Refused where the number "
-        "of photons is not known.",
+        "noise included. Photon counts are thinned, which is exact; other readings get the right "
+        "mean and variance. Refused where the number of photons is not known.",
         "torchpcct lower-dose scan.h5 --fraction 0.25 --out quarter.h5",
         out="HDF5 file to write (default SCAN_FRACTION.h5)",
     )

@@ -219,8 +219,7 @@ def _sent(
         except Unportable as error:
             log.warning(
                 "%s is computed here, not by other processes: it is made of a function that they "
-                "cannot load (%s); a "
-                "function of a module can be loaded",
+                "cannot load (%s); a function of a module can be loaded",
                 method.name,
                 error,
             )

@@ -246,8 +246,8 @@ def check_volume(volume: Tensor, method: Method, reader: Reader, fbp: Tensor) ->
     if not 0.2 < scale < 5.0 or float((volume - truth).mean().abs()) > 300.0:
         raise ValueError(
             f"{method.name}: its noise-free volume is {scale:.3g} times the truth, mean "
-            f"{float(volume.mean()):.4g} for "
-            f"{float(truth.mean()):.4g} HU: does it give HU (water 0, air -1000)?"
+            f"{float(volume.mean()):.4g} for {float(truth.mean()):.4g} HU: does it give HU (water "
+            "0, air -1000)?"
         )
     # Its place by FBP: with few views streaks are larger than edges.
     a = fbp - fbp.mean()
@@ -257,8 +257,7 @@ def check_volume(volume: Tensor, method: Method, reader: Reader, fbp: Tensor) ->
     if any(abs(k) > _SHIFT_VOXELS for k in off):
         raise ValueError(
             f"{method.name}: its noise-free volume is shifted by {off} voxels (z, y, x): voxel "
-            "centres lie at "
-            "grid.axes, ascending"
+            "centres lie at grid.axes, ascending"
         )
 
 

@@ -279,8 +279,7 @@ def _of_files(spec: str, folder: Path) -> Method:
         if not found:
             raise FileNotFoundError(
                 f"{folder} holds no volume {draw.label}, by itself or with _fbp, _pwls or _mbir "
-                "behind: reconstruct "
-                "the exported scan of that name"
+                "behind: reconstruct the exported scan of that name"
             )
         volume = Volume.load(found[0])
         if not same_grid(volume.grid, draw.grid):

@@ -146,8 +146,7 @@ class Task:
         if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}", str(self.name)):
             raise ValueError(
                 "the name of a task is that of its files: letters, digits, '.', '_' and '-', at "
-                "most 64, no '.' at the "
-                f"start; got {str(self.name)[:80]!r}"
+                f"most 64, no '.' at the start; got {str(self.name)[:80]!r}"
             )
         signal = (self.signal,) if isinstance(self.signal, str) else tuple(self.signal)
         if not signal:
@@ -333,8 +332,8 @@ class Task:
             if not outer.any():
                 raise ValueError(
                     f"task {self.name}: no voxel beside the signal lies wholly in "
-                    f"{self.background!r} (ROI {name}): "
-                    "take smaller voxels, or name another background"
+                    f"{self.background!r} (ROI {name}): take smaller voxels, or name another "
+                    "background"
                 )
         pairs = {n: (_mean(a), _mean(b)) for n, (a, b) in found.items()}
         return {**pairs, **self.rois}
@@ -356,8 +355,7 @@ class Task:
                 return np.asarray(share > least)
         raise ValueError(
             f"task {self.name}: {int((share > _MOSTLY).sum())} voxels of the inset lie in "
-            f"{name!r}, {_FEW} are needed: "
-            "take smaller voxels, or an inset that holds it"
+            f"{name!r}, {_FEW} are needed: take smaller voxels, or an inset that holds it"
         )
 
     def _small(self, signal: Any, around: Any, here: Any) -> tuple[Any, Any]:

@@ -504,8 +504,7 @@ class AnatomyTask(_PaintedTask):
         if self.signal != (_FEATURE,) or self.background not in grounds:
             raise ValueError(
                 f"task {self.name}: of an anatomy the signal is {_FEATURE!r} and the background "
-                "one of "
-                f"{', '.join(grounds)}, got {', '.join(self.signal)} and {self.background!r}"
+                f"one of {', '.join(grounds)}, got {', '.join(self.signal)} and {self.background!r}"
             )
 
     @property

@@ -127,8 +127,7 @@ def evaluate_scans(
     if given[0].counts.shape != given[1].counts.shape:
         raise ValueError(
             f"the scans have {tuple(given[0].counts.shape)} and {tuple(given[1].counts.shape)} "
-            "readings: two scans of "
-            "one object by one scanner are needed"
+            "readings: two scans of one object by one scanner are needed"
         )
     if n > 1 and given[0].geometry != given[1].geometry:
         raise ValueError(
@@ -255,12 +254,10 @@ def _note(scan: Scan, grid: VolumeGrid) -> str:
         [s / k for s, k in zip(grid.spacing, parts, strict=True)][-len(cells) :],
     )
     return (
-        f"voxels of {_lengths(voxels)} mm are coarser than the detector's cells, "
-        f"{_lengths(cells)} mm at the axis, and "
-        f"FBP on them aliases noise. FBP, {_REFERENCE} too, was therefore reconstructed on voxels "
-        f"of {_lengths(fine)} "
-        "mm and resampled without aliasing, also as the base of denoisers: its noise is less than "
-        "on the coarse voxels"
+        f"voxels of {_lengths(voxels)} mm are coarser than the detector's cells, {_lengths(cells)} "
+        f"mm at the axis, and FBP on them aliases noise. FBP, {_REFERENCE} too, was therefore "
+        f"reconstructed on voxels of {_lengths(fine)} mm and resampled without aliasing, also as "
+        "the base of denoisers: its noise is less than on the coarse voxels"
     )
 
 
@@ -353,19 +350,16 @@ def _condition(spacing: Sequence[float], cells: Sequence[float] | None) -> str:
         return (
             "it is taken that the detector's cells at the axis are no smaller than the voxels, "
             f"{max(spacing[1:]):.3g} mm in the plane: on coarser voxels FBP aliases noise, and "
-            "every smoother method "
-            "seems to save dose"
+            "every smoother method seems to save dose"
         )
     voxels = spacing[-len(cells) :]
     if all(s <= _COARSE * cell for s, cell in zip(voxels, cells, strict=True)):
         return ""
     return (
         f"these factors are not to be trusted: the voxels of {_lengths(voxels)} mm are coarser "
-        "than the detector's "
-        f"cells, {_lengths(cells)} mm at the axis, so FBP aliases noise and every smoother method "
-        "seems to save dose; "
-        "give a reference on voxels no coarser than the cells or averaged from such, or the scans "
-        "(--scans)"
+        f"than the detector's cells, {_lengths(cells)} mm at the axis, so FBP aliases noise and "
+        "every smoother method seems to save dose; give a reference on voxels no coarser than the "
+        "cells or averaged from such, or the scans (--scans)"
     )
 
 

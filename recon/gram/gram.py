@@ -106,8 +106,7 @@ def make_definite(spectra: Tensor) -> Tensor:
     ):
         raise ValueError(
             "spectra must be (terms, reach + 1, nz, fy, fx) of 1, 3 or 6 terms and reach < nz, "
-            "got the shape "
-            f"{tuple(spectra.shape)}"
+            f"got the shape {tuple(spectra.shape)}"
         )
     terms, bands, nz = spectra.shape[:3]
     flat = spectra.reshape(terms, bands, nz, -1).to(torch.complex128).numpy().copy()

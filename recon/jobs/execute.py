@@ -431,8 +431,7 @@ class Cluster(Executor):
         if since is not None and now - since >= tell_at:
             log.warning(
                 "no worker since %.0f s: jobs wait until one comes to the scheduler %s (dask "
-                "worker --nthreads 1); "
-                "what is done is kept, Ctrl-C ends",
+                "worker --nthreads 1); what is done is kept, Ctrl-C ends",
                 now - since,
                 self.address,
             )
@@ -563,8 +562,7 @@ def _do_job(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _
             raise Unfit(
                 where,
                 f"takes {at_once} jobs at once: start it with --nthreads 1 (more workers of a "
-                "machine: "
-                "--nworkers)",
+                "machine: --nworkers)",
             )
         if of.path and of.path not in sys.path and os.path.isdir(of.path):
             sys.path.append(of.path)
@@ -783,8 +781,8 @@ def _run(
         listed = [f"{name} ({why})" for name, why in lost.items()]
         raise LeftOut(
             f"{len(lost)} of {len(jobs)} jobs are missing: "
-            f"{'; '.join(listed[:5])}{'; …' if listed[5:] else ''}. The "
-            "others are done and kept: the same command tries these again"
+            f"{'; '.join(listed[:5])}{'; …' if listed[5:] else ''}. The others are done and kept: "
+            "the same command tries these again"
         )
     return values
 
@@ -870,8 +868,7 @@ def _table(jobs: Sequence[Job]) -> str:
     total = sum(j.seconds for j in jobs)
     rows.append(
         f"{len(jobs)} jobs, about {total / 3600:.2f} core hours, "
-        f"{max((j.mib for j in jobs), default=0.0):.0f} MiB in "
-        f"a process, {sum(j.bytes for j in jobs) / 1e6:.1f} MB kept (estimates of one core; 0: "
-        "not known)"
+        f"{max((j.mib for j in jobs), default=0.0):.0f} MiB in a process, "
+        f"{sum(j.bytes for j in jobs) / 1e6:.1f} MB kept (estimates of one core; 0: not known)"
     )
     return "\n".join(rows)

@@ -201,8 +201,7 @@ class FieldProblem:
             if report["undetermined_rmsd_hu"] > UNDETERMINED_HU:
                 found.append(
                     f"{100 * report['undetermined']:.0f} % of the voxels are missed by some views "
-                    "(corners beyond the "
-                    "field of view, outer slices): there the volume is "
+                    "(corners beyond the field of view, outer slices): there the volume is "
                     f"{in_words(report['undetermined_rmsd_hu'], self.unit, self.mu_ref)} from the "
                     "minimum"
                 )

@@ -114,8 +114,7 @@ class InsetProblem:
         except ValueError as error:
             raise ValueError(
                 "what lies around this inset is not known, and has to be found by FBP of the "
-                f"whole field: {error}; or "
-                "take a grid that holds the whole field of view"
+                f"whole field: {error}; or take a grid that holds the whole field of view"
             ) from error
 
     def _place(self, motion: Any) -> None:

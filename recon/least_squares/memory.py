@@ -78,10 +78,8 @@ def require_memory(A: Any, batch: int, like: Tensor, memory: int | None) -> None
     if need > free:
         raise ValueError(
             f"PWLS of {batch} volume(s) {tuple(A.domain_shape)} from data {tuple(A.range_shape)} "
-            "needs "
-            f"{need / 2**30:.2f} GiB, {free / 2**30:.2f} GiB are available: take larger or fewer "
-            "voxels, float32, "
-            "fewer volumes at a time, or bin the readings"
+            f"needs {need / 2**30:.2f} GiB, {free / 2**30:.2f} GiB are available: take larger or "
+            "fewer voxels, float32, fewer volumes at a time, or bin the readings"
         )
 
 

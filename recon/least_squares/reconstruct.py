@@ -86,8 +86,8 @@ def reconstruct_pwls(
                 )
                 said.append(
                     f"PWLS stopped {left} from the minimum after {report['exact_pairs']} "
-                    "projection pairs (tolerance "
-                    f"{asked}): raise max_exact, or strengthen the prior"
+                    f"projection pairs (tolerance {asked}): raise max_exact, or strengthen the "
+                    "prior"
                 )
                 warnings.warn(said[-1], RuntimeWarning, stacklevel=2)
             found.append(solution._replace(warnings=[*said, *solution.warnings]))

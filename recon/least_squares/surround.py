@@ -105,9 +105,8 @@ class UnknownSurround:
         if any(cut_off(lines, self.geometry, angular_weights(self.geometry))):
             raise ValueError(
                 "the rows end inside the object: what lies beyond the field of view cannot be "
-                "taken off the inset's "
-                "readings (250 HU of a thorax were left); use fbp with outside=, or a detector "
-                "that holds the body"
+                "taken off the inset's readings (250 HU of a thorax were left); use fbp with "
+                "outside=, or a detector that holds the body"
             )
         fine = fbp(lines, self.geometry, self.grid)
         around = lines.clone()

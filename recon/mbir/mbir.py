@@ -120,8 +120,7 @@ class Mbir:
                 raise ValueError(f"{source}: {error}") from error
             raise ValueError(
                 f"{source} holds no weights of this unrolled reconstruction: {error} (shipped "
-                "weights come back with "
-                "a new installation of the package)"
+                "weights come back with a new installation of the package)"
             ) from error
         return cls(model, fidelity)
 
@@ -280,8 +279,7 @@ class Mbir:
             if bad and step:
                 raise ValueError(
                     f"the prior {self.prior_name} returned NaN or infinite values in {bad} of "
-                    f"{v.numel()} voxels: use "
-                    "other weights, or another prior"
+                    f"{v.numel()} voxels: use other weights, or another prior"
                 )
 
         found: Tensor = self.model(normal, self.fidelity, callback=watch, **{**parts, **self.parts})
@@ -430,8 +428,7 @@ def _fill(model: Unrolled, tensors: Mapping[str, Tensor]) -> None:
         if there != here:
             raise ValueError(
                 f"they do not fit {name_of(model.network)}: {name} has the shape {there} in the "
-                f"file, {here} in the "
-                "network"
+                f"file, {here} in the network"
             )
     model.load_state_dict(tensors)
 

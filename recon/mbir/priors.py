@@ -174,20 +174,17 @@ def same_kind(made: Any, given: Tensor, prior: Any) -> Tensor:
     if not isinstance(made, Tensor):
         raise TypeError(
             f"the prior {name_of(prior)} returned {type(made).__name__}: it must return a tensor "
-            "like the one it is "
-            "given (torch.from_numpy makes one of an array)"
+            "like the one it is given (torch.from_numpy makes one of an array)"
         )
     if made.shape != given.shape:
         raise ValueError(
             f"the prior {name_of(prior)} returned the shape {tuple(made.shape)} for "
-            f"{tuple(given.shape)}: it must "
-            "return one value for each voxel"
+            f"{tuple(given.shape)}: it must return one value for each voxel"
         )
     if made.dtype != given.dtype or made.device != given.device:
         raise ValueError(
             f"the prior {name_of(prior)} returned {made.dtype} on {made.device} for {given.dtype} "
-            f"on {given.device}: "
-            "end it with .to(...) of what it is given"
+            f"on {given.device}: end it with .to(...) of what it is given"
         )
     return made
 

@@ -509,8 +509,7 @@ def _images(m: Found) -> Any:
         labels,
         "Residual motion, and compensation of the largest",
         f"C150 / W600 HU; error maps C0 / W{_ERROR_WIDTH_HU:g} HU. Outlines: lumen (red), core "
-        "where segmented "
-        "(yellow).",
+        "where segmented (yellow).",
     )
     figure.set_size_inches(0.6 * figure.get_size_inches())  # ten rows of small images
     return figure

@@ -350,9 +350,8 @@ def checks(data: dict[str, Any]) -> list[Check]:
     own, roi_hu, eid = e["own_contrast_hu"] / p["own_contrast_hu"], p["roi_hu"], e["blurred"][0]
     coarse = (
         f"the contrast {'rises' if own > 1 else 'falls'} to {100 * own:.0f} %, the noise of the "
-        "ROI means to "
-        f"{100 * e['contrast_sd_hu'] / p['contrast_sd_hu']:.0f} %: the coarse cells pass little "
-        "of the noise either"
+        f"ROI means to {100 * e['contrast_sd_hu'] / p['contrast_sd_hu']:.0f} %: the coarse cells "
+        "pass little of the noise either"
     )
     return [
         around("PCCT core ROI, HU", roi_hu[0], core, 8.0),

@@ -201,8 +201,7 @@ def follow(
     if not mass:
         raise ValueError(
             f"no vessel brighter than {threshold:.0f} HU at {np.round(start, 2).tolist()} mm (z, "
-            "y, x): "
-            "the reader needs a lumen with contrast agent; give a point in it or beside it"
+            "y, x): the reader needs a lumen with contrast agent; give a point in it or beside it"
         )
     halves: list[list[Floats]] = []
     ends = []
@@ -231,10 +230,8 @@ def follow(
     if len(found) < 6:
         raise ValueError(
             f"the bright region at {np.round(start, 1).tolist()} mm (z, y, x) is no vessel that "
-            "can be read: it has no "
-            "direction, or is shorter than 5 mm. Rings of metal (a stent), bone and noise are as "
-            "bright; give a point "
-            "in a lumen with contrast agent"
+            "can be read: it has no direction, or is shorter than 5 mm. Rings of metal (a stent), "
+            "bone and noise are as bright; give a point in a lumen with contrast agent"
         )
     line = Centreline(smooth_line(found))
     profile = np.linspace(-2.0, line.length + 2.0, int((line.length + 4.0) / 0.05))

@@ -256,7 +256,6 @@ def _strange_tissue(fit: Fit) -> str:
         if not least <= value - fat <= most:
             return (
                 f"its {name} would have {value - fat:.0f} HU more than what lies around the "
-                "vessel, and a coronary "
-                f"artery's has {least:.0f} to {most:.0f}"
+                f"vessel, and a coronary artery's has {least:.0f} to {most:.0f}"
             )
     return ""

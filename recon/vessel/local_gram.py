@@ -70,9 +70,8 @@ class LocalGram:
         size = 4 * sum(int(counts[: nz - b] @ counts[b:]) for b in range(lags))
         if size > LARGEST:
             raise ValueError(
-                f"the vessel holds {len(index)} voxels, whose operator would take "
-                f"{size / 1e9:.1f} GB: "
-                "take larger voxels or a smaller inset"
+                f"the vessel holds {len(index)} voxels, whose operator would take {size / 1e9:.1f} "
+                "GB: take larger voxels or a smaller inset"
             )
         planes = [np.ascontiguousarray(index[slices[z] : slices[z + 1], 1:]) for z in range(nz)]
         runs = [_runs(p) for p in planes]

@@ -144,29 +144,25 @@ class PlaqueReading:
             z, y, x = self.left.at_mm
             found.append(
                 f"{'beside' if self.left.beside else 'in'} the vessel, at ({z:.1f}, {y:.1f}, "
-                f"{x:.1f}) mm (z, y, x), "
-                f"the data show {self.left.hu:+.0f} HU ({self.left.score:.0f} standard deviations "
-                "of the noise) that "
-                f"one vessel in fat does not explain: {_BESIDE if self.left.beside else _INSIDE}? "
-                "Figures of plaque "
+                f"{x:.1f}) mm (z, y, x), the data show {self.left.hu:+.0f} HU "
+                f"({self.left.score:.0f} standard deviations of the noise) that one vessel in fat "
+                f"does not explain: {_BESIDE if self.left.beside else _INSIDE}? Figures of plaque "
                 "bodies are refused; do not trust the others"
             )
         if abs(self.chi2 - 1.0) > _MISFIT * self.chi2_sd:
             found.append(
                 f"the residual is {self.chi2:.2f} of what noise leaves ({self.chi2_sd:.2f} "
-                "standard deviation): "
-                "there is something here that the model does not have; do not trust the intervals"
+                "standard deviation): there is something here that the model does not have; do "
+                "not trust the intervals"
             )
         if self.third_core is not None:
             z, y, x = self.third_core["at_mm"]
             found.append(
                 "one more core is there with a probability of "
-                f"{self.third_core['probability']:.2f}, at ({z:.1f}, "
-                f"{y:.1f}, {x:.1f}) mm (z, y, x), of about {self.third_core['volume_mm3']:.1f} "
-                "mm³ and "
+                f"{self.third_core['probability']:.2f}, at ({z:.1f}, {y:.1f}, {x:.1f}) mm (z, y, "
+                f"x), of about {self.third_core['volume_mm3']:.1f} mm³ and "
                 f"{self.third_core['contrast_hu']:.0f} HU of contrast: the fitted tissues show "
-                "fibrous tissue in its "
-                "place; do not trust the intervals"
+                "fibrous tissue in its place; do not trust the intervals"
             )
         return found
 

@@ -85,25 +85,21 @@ def table(
         lines += [
             "",
             f"A second core is there with a probability of {second['probability']:.3f}, at "
-            f"({z:.1f}, {y:.1f}, {x:.1f}) "
-            f"mm (z, y, x), of about {second['volume_mm3']:.1f} mm³. Both were read together; the "
-            "figures are those of "
-            "the first, but for the second contrast.",
+            f"({z:.1f}, {y:.1f}, {x:.1f}) mm (z, y, x), of about {second['volume_mm3']:.1f} mm³. "
+            "Both were read together; the figures are those of the first, but for the second "
+            "contrast.",
         ]
     if reading.explained and not reading.taken_off_hu:
         lines += [
             "",
             f"Contrast over a core that is there and one that is not: {reading.mean_contrast:.0f} "
-            "HU. A contrast is "
-            "given where the data prove a core, so rather where noise has enlarged it: on average "
-            "those given are too "
-            "large.",
+            "HU. A contrast is given where the data prove a core, so rather where noise has "
+            "enlarged it: on average those given are too large.",
         ]
     lines += [
         "",
-        f"Residual: {reading.chi2:.3f} ± {reading.chi2_sd:.3f} of what noise "
-        f"leaves. Texture of 0.3 mm: {reading.texture_hu:.0f} HU, at most "
-        f"{reading.texture_high_hu:.0f} HU (95 %). "
+        f"Residual: {reading.chi2:.3f} ± {reading.chi2_sd:.3f} of what noise leaves. Texture of "
+        f"0.3 mm: {reading.texture_hu:.0f} HU, at most {reading.texture_high_hu:.0f} HU (95 %). "
         "Believed before the data: "
         + ", ".join(
             "{} {:g} ± {:g} HU".format(n, *reading.info["vessel_prior"][n])

@@ -79,10 +79,8 @@ def find_vessel(pilot: Floats, grid: VolumeGrid, point: Floats | None) -> Start:
     if blood - fat < _LEAST_LUMEN_HU:
         raise ValueError(
             f"the brightest tissue at {np.round(middle, 1).tolist()} mm (z, y, x) reads "
-            f"{blood:.0f} HU in surroundings "
-            f"of {fat:.0f} HU: the outline of a lumen is determined only with contrast agent (at "
-            "least "
-            f"{_LEAST_LUMEN_HU:.0f} HU above fat)"
+            f"{blood:.0f} HU in surroundings of {fat:.0f} HU: the outline of a lumen is determined "
+            f"only with contrast agent (at least {_LEAST_LUMEN_HU:.0f} HU above fat)"
         )
     half = fat + _LUMEN_AT * (blood - fat)
     try:
@@ -121,8 +119,8 @@ def require_within(point: Any, grid: VolumeGrid) -> None:
     if np.any(np.asarray(point) < low) or np.any(np.asarray(point) > low + np.array(grid.extent)):
         raise ValueError(
             f"the point {np.asarray(point).tolist()} mm (z, y, x) lies outside of the volume, "
-            "which reaches from "
-            f"{np.round(low, 2).tolist()} to {np.round(low + np.array(grid.extent), 2).tolist()} mm"
+            f"which reaches from {np.round(low, 2).tolist()} to "
+            f"{np.round(low + np.array(grid.extent), 2).tolist()} mm"
         )
 
 
@@ -131,6 +129,6 @@ def _require(seen: bool, at: Floats, why: str) -> None:
     if not seen:
         raise ValueError(
             f"the bright region at {np.round(at, 1).tolist()} mm (z, y, x) is no vessel that can "
-            f"be read: {why}. Metal "
-            "(a stent), bone and noise are as bright; give a point in a lumen with contrast agent"
+            f"be read: {why}. Metal (a stent), bone and noise are as bright; give a point in a "
+            "lumen with contrast agent"
         )

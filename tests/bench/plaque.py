@@ -469,8 +469,7 @@ def _contrast(entry: dict[str, Any]) -> str:
     if "given" not in entry:
         return (
             f"Contrast if there were one: {entry['contrast_if_there']:+.1f} HU; over a core that "
-            "is there and one "
-            f"that is not: {entry['mean_contrast']:+.1f} HU."
+            f"is there and one that is not: {entry['mean_contrast']:+.1f} HU."
         )
     told = "No contrast given."
     if entry["given"]["n"]:
@@ -497,10 +496,8 @@ def text(result: dict[str, Any]) -> str:
         f"`{result['command']}`",
         "",
         "Bias and SD of the posterior mean over the draws; coverage: of the 95 % intervals; told: "
-        "mean posterior "
-        "SD. Beside them what other volumes of the same scans read over the same regions, and by "
-        "thresholds "
-        "(FBP, middle slice, true centres given).",
+        "mean posterior SD. Beside them what other volumes of the same scans read over the same "
+        "regions, and by thresholds (FBP, middle slice, true centres given).",
         "",
     ]
     for entry in result["cases"].values():
@@ -508,19 +505,15 @@ def text(result: dict[str, Any]) -> str:
         lines += [
             f"## {entry['case']}: n = {entry['n']}",
             "",
-            f"Claimed (P ≥ {CERTAIN}): {entry['claimed']} of {entry['n']} "
-            f"[{share['low']:.2f}, {share['high']:.2f}]; "
-            f"median P {entry['median_presence']:.3f}, least {entry['least_presence']:.3f}; "
-            f"not read {entry['failed']}; "
-            f"calcified {entry['calcified']}; a second core {entry['second_core']}; "
-            f"warned {entry['warned']}; residual {entry['chi2']:.3f}; texture "
-            f"{entry['texture_hu']:.1f} HU; {entry['cpu_seconds']:.1f} CPU s a reading (loaded "
-            "machine). "
-            f"{_contrast(entry)}",
+            f"Claimed (P ≥ {CERTAIN}): {entry['claimed']} of {entry['n']} [{share['low']:.2f}, "
+            f"{share['high']:.2f}]; median P {entry['median_presence']:.3f}, least "
+            f"{entry['least_presence']:.3f}; not read {entry['failed']}; calcified "
+            f"{entry['calcified']}; a second core {entry['second_core']}; warned "
+            f"{entry['warned']}; residual {entry['chi2']:.3f}; texture {entry['texture_hu']:.1f} "
+            f"HU; {entry['cpu_seconds']:.1f} CPU s a reading (loaded machine). {_contrast(entry)}",
             "",
             "| | true | mean | bias | SD [95 %] | told | RMSE | coverage | soft FBP: mean, SD | "
-            "MBIR: mean, SD | "
-            "FBP by thresholds: bias, RMSE |",
+            "MBIR: mean, SD | FBP by thresholds: bias, RMSE |",
             "|---" * 11 + "|",
         ]
         for name, f in entry["figures"].items():

@@ -200,8 +200,7 @@ def tuning_text(kept: dict[str, Any]) -> str:
         "# Settings of the rivals",
         "",
         "`python tests/bench/rivals.py`: error in the vessel, HU, on held-out plaques; lengths in "
-        "voxels of "
-        "0.2 mm, thresholds in units of the noise.",
+        "voxels of 0.2 mm, thresholds in units of the noise.",
         "",
         f"| s | base | filter | unfiltered | mean | {' | '.join(DIRECTIONS)} | settings |",
         "|---" * (6 + len(DIRECTIONS)) + "|",

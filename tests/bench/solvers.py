@@ -148,8 +148,7 @@ def main() -> None:
             "# PWLS: distance to the converged minimum",
             "",
             f"`python tests/bench/solvers.py --views {args.views} --voxel {args.voxel:g}`; the "
-            "Gram operator "
-            f"({p.gram_seconds:.1f} s once per scan) is not counted.",
+            f"Gram operator ({p.gram_seconds:.1f} s once per scan) is not counted.",
             "",
             "| solver | exact pairs | seconds | rms distance, HU |",
             "|---|---|---|---|",

@@ -105,9 +105,8 @@ class Plan:
             )
         lines.append(
             f"  {len(self.points)} sub-rays a reading, rms sampling error "
-            f"{self.sampling_error:.1e} of the peak; "
-            f"{self.readings / 1e6:.2f} M readings, about {self.seconds:.0f} s, "
-            f"{self.bytes / 2**30:.2f} GiB"
+            f"{self.sampling_error:.1e} of the peak; {self.readings / 1e6:.2f} M readings, about "
+            f"{self.seconds:.0f} s, {self.bytes / 2**30:.2f} GiB"
         )
         return "\n".join(lines)
 

@@ -79,10 +79,9 @@ def column_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     if abs(place) - _SIGMAS * error > PLACE_TOLERANCE:
         findings.append(
             f"the columns of even and of odd number lie about {abs(place):.1f} columns beside "
-            "their places, to either "
-            f"side ({abs(place) / error:.0f} standard errors): neighbouring columns are "
-            "exchanged, or interleaved the "
-            "wrong way; edges are torn; sort the columns"
+            f"their places, to either side ({abs(place) / error:.0f} standard errors): "
+            "neighbouring columns are exchanged, or interleaved the wrong way; edges are torn; "
+            "sort the columns"
         )
     return ScanTest({"gain": gain, "place": place}, {"place": error}, tuple(findings))
 
@@ -161,8 +160,8 @@ def _gain_text(
     reads = "reads" if width == 1 else "read"
     return (
         f"{what}{more} {reads} {1.0 + size:.3g} ± {error * (1.0 + size):.1g} times what its "
-        "neighbours do, in all "
-        "views: a wrong gain, which draws a ring; measure air again, or mask it (dead=)"
+        "neighbours do, in all views: a wrong gain, which draws a ring; measure air again, or "
+        "mask it (dead=)"
     )
 
 

@@ -143,8 +143,7 @@ def find_defects(
     if counts.ndim != 3 or air.ndim != 2 or air.shape[0] != counts.shape[1]:
         raise ValueError(
             "counts must be (views, rows, columns) and air (rows, detector columns), got "
-            f"{tuple(counts.shape)} and "
-            f"{tuple(air.shape)}"
+            f"{tuple(counts.shape)} and {tuple(air.shape)}"
         )
     n = counts.detach().cpu().numpy()
     views, _, columns = n.shape

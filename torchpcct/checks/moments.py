@@ -126,10 +126,9 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     if _LARGEST_STEP > abs(step) > STEP_TOLERANCE + turned * amplified + _SIGMAS * step_error:
         findings.append(
             "the centre of mass and the width of the views do not turn with them: the steps "
-            "between the views are "
-            f"described about {100 * abs(step):.2g} ± {100 * step_error:.1g} % too "
-            f"{'small' if step > 0 else 'large'}: "
-            "the range of the angles is wrong, or the object moved"
+            f"between the views are described about {100 * abs(step):.2g} ± {100 * step_error:.1g} "
+            f"% too {'small' if step > 0 else 'large'}: the range of the angles is wrong, or the "
+            "object moved"
         )
     # Readings that are no line integrals shift the centre of mass by their share of the radius,
     # motion keeps the sum.
@@ -138,30 +137,24 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     ):
         findings.append(
             "the centre of mass of the views leaves the sinusoid of an object at rest by "
-            f"{centre:.2g} ± "
-            f"{centre_error:.1g} mm (root mean square): the object moved (breathing, a table), or "
-            "the angles of the "
-            "views are wrong; edges are double or smeared; gate the views, or give the motion"
+            f"{centre:.2g} ± {centre_error:.1g} mm (root mean square): the object moved "
+            "(breathing, a table), or the angles of the views are wrong; edges are double or "
+            "smeared; gate the views, or give the motion"
         )
     elif axial - _SIGMAS * axial_error > axial_tolerance:
         findings.append(
-            f"the object lies about {axial:.2g} mm higher or lower in the course of the turn "
-            "(root mean square, "
-            f"{axial / axial_error:.0f} standard errors): it moved along the axis, or the table "
-            "did (a helix told as a "
-            "circle); give the motion"
+            f"the object lies about {axial:.2g} mm higher or lower in the course of the turn (root "
+            f"mean square, {axial / axial_error:.0f} standard errors): it moved along the axis, or "
+            "the table did (a helix told as a circle); give the motion"
         )
     elif weight - _SIGMAS * weight_error > WEIGHT_TOLERANCE + lacks:
         findings.append(
-            "the sum of a view's line integrals changes with its direction, by "
-            f"{100 * weight:.2g} ± "
-            f"{100 * weight_error:.1g} % (root mean square), that of any object does not: the "
-            "readings lack most where "
-            "the object is thickest (beam hardening by bone or metal, scatter, a dark signal left "
-            "in, pile-up, "
-            "saturation, or too few photons for a logarithm), the object moved, or it reaches "
-            "beyond the rows in some "
-            "views; values are wrong by tens of HU, in long shades"
+            f"the sum of a view's line integrals changes with its direction, by {100 * weight:.2g} "
+            f"± {100 * weight_error:.1g} % (root mean square), that of any object does not: the "
+            "readings lack most where the object is thickest (beam hardening by bone or metal, "
+            "scatter, a dark signal left in, pile-up, saturation, or too few photons for a "
+            "logarithm), the object moved, or it reaches beyond the rows in some views; values "
+            "are wrong by tens of HU, in long shades"
         )
     found = {
         "weight": (weight, weight_error),

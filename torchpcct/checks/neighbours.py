@@ -144,12 +144,10 @@ def neighbour_test(lines: Tensor, geometry: Geometry) -> ScanTest:
         if order > limit:
             findings.append(
                 f"neighbouring views differ as much as {100 * min(order, 1.0):.0f} % of what any "
-                "two views do, of an "
-                f"object that turns by {math.degrees(views.step):.2g}° at most {100 * limit:.0f} "
-                "%: the views are not "
-                "in the order of their angles (files sorted by the text of their names: 1, 10, "
-                "100, 2?), or the angles "
-                "are wrong; everything in the volume is"
+                f"two views do, of an object that turns by {math.degrees(views.step):.2g}° at most "
+                f"{100 * limit:.0f} %: the views are not in the order of their angles (files "
+                "sorted by the text of their names: 1, 10, 100, 2?), or the angles are wrong; "
+                "everything in the volume is"
             )
             return ScanTest(sizes, errors, tuple(findings))
     jumps, alternating, scatter = views.jumps(), views.alternation(), None
@@ -396,9 +394,8 @@ class _Views:
             steps,
             spread,
             f"the views scatter by about {steps:.1g} of a step about the described angles "
-            f"({sigmas:.0f} standard "
-            "errors): the gantry does not turn evenly, or the object trembles; give the measured "
-            "angle of each view",
+            f"({sigmas:.0f} standard errors): the gantry does not turn evenly, or the object "
+            "trembles; give the measured angle of each view",
         )
 
     def _share(
@@ -433,27 +430,24 @@ class _Views:
         if self.closes and most == n - 1:
             return (
                 f"the last view (number {self.number[-1]}) does not lead back to the first "
-                f"({self.number[0]}): they "
-                f"differ by {abs(size):.2g} times what neighbouring views do {sure}: something "
-                "moved on during "
-                "the turn (a table that travels, a helix told as a circle, an object that sinks "
-                "or breathes), or the "
-                "range of the angles is wrong; give the motion or the true angles"
+                f"({self.number[0]}): they differ by {abs(size):.2g} times what neighbouring views "
+                f"do {sure}: something moved on during the turn (a table that travels, a helix "
+                "told as a circle, an object that sinks or breathes), or the range of the angles "
+                "is wrong; give the motion or the true angles"
             )
         pair = f"the views {self.number[most]} and {self.number[(most + 1) % n]}"
         more = f" (and {len(at) - 1} more pairs)" if len(at) > 1 else ""
         if explained and size > 0.0:
             return (
                 f"{pair}{more} lie about {1.0 + size:.2g} steps apart, not one {sure}: views are "
-                "missing there, stuck "
-                "or out of order (files sorted by the text of their names: 1, 10, 100, 2?), or "
-                "the angles are wrong; "
-                "give the angle of each view, in the order of the views"
+                "missing there, stuck or out of order (files sorted by the text of their names: "
+                "1, 10, 100, 2?), or the angles are wrong; give the angle of each view, in the "
+                "order of the views"
             )
         return (
             f"{pair}{more} differ by {abs(size):.2g} times what neighbouring views do {sure}: "
-            "views are exchanged, "
-            "missing, stuck or out of order, or the object moved; sort the views by their angles"
+            "views are exchanged, missing, stuck or out of order, or the object moved; sort the "
+            "views by their angles"
         )
 
     def alternation(self) -> tuple[float, float, str] | None:
@@ -492,12 +486,10 @@ class _Views:
                         scale * size,
                         scale * error,
                         f"views that follow each other lie about {scale * size:.2g} {along} apart "
-                        "by turns, with a "
-                        f"period of {period} views ({size / error:.0f} standard errors): a focal "
-                        "spot that flies, "
-                        "which the geometry does not describe; give its positions "
-                        "(VectorGeometry), or reconstruct "
-                        "the views of one position",
+                        f"by turns, with a period of {period} views ({size / error:.0f} standard "
+                        "errors): a focal spot that flies, which the geometry does not describe; "
+                        "give its positions (VectorGeometry), or reconstruct the views of one "
+                        "position",
                     )
         return best
 
@@ -592,10 +584,9 @@ def stuck_views(readings: Tensor, geometry: Geometry) -> list[str]:
     which = ", ".join(map(str, views)) if len(views) <= 4 else f"{views[0]} … {views[-1]}"
     return [
         *dark,
-        f"{len(views)} views{where} hold the same readings as views at other angles, noise and "
-        f"all (views {which}): "
-        "the detector was stuck, or files were copied; leave them out (Scan.select), or mask them "
-        "(dead=)",
+        f"{len(views)} views{where} hold the same readings as views at other angles, noise and all "
+        f"(views {which}): the detector was stuck, or files were copied; leave them out "
+        "(Scan.select), or mask them (dead=)",
     ]
 
 
@@ -639,10 +630,8 @@ def _dark_columns(n: NDArray[Any], order: NDArray[np.int64]) -> list[str]:
     (column, width, first), views = max(found.items(), key=lambda item: item[0][1] * item[1])
     return [
         f"the columns {column} … {column + width - 1} read nothing in {views} views from number "
-        f"{order[first]} on, and "
-        "go dark and bright again all at once, which no shadow does: a module of the detector was "
-        "off; mask it "
-        "(dead=), or leave the views out (Scan.select)"
+        f"{order[first]} on, and go dark and bright again all at once, which no shadow does: a "
+        "module of the detector was off; mask it (dead=), or leave the views out (Scan.select)"
     ]
 
 

@@ -266,10 +266,8 @@ def _unrolled(lines: Tensor, geometry: Any, window: DetectorWindow | None, roll:
 def _centre_text(size: float, error: float) -> str:
     return (
         f"opposite rays disagree: the geometry puts the columns about {abs(size):.2f} ± "
-        f"{error:.2g} columns too "
-        f"{'high' if size > 0 else 'low'}: the rotation centre (the detector's column offset) is "
-        "wrong, or the object "
-        "moved"
+        f"{error:.2g} columns too {'high' if size > 0 else 'low'}: the rotation centre (the "
+        "detector's column offset) is wrong, or the object moved"
     )
 
 
@@ -279,29 +277,25 @@ def _scale_text(size: float, error: float) -> str:
     )
     return (
         f"opposite rays disagree: the fan angles are described about {100 * abs(size):.2g} ± "
-        f"{100 * error:.1g} % too "
-        f"{small}: the column pitch is {pitch} than described, the distance source-detector (sdd) "
-        f"{sdd}, or the "
-        "detector is not flat or curved as described; sizes and values in the volume are wrong by "
-        "as much"
+        f"{100 * error:.1g} % too {small}: the column pitch is {pitch} than described, the "
+        f"distance source-detector (sdd) {sdd}, or the detector is not flat or curved as "
+        "described; sizes and values in the volume are wrong by as much"
     )
 
 
 def _step_text(size: float, error: float) -> str:
     return (
         "opposite rays disagree: the steps between the views are described about "
-        f"{100 * abs(size):.2g} ± "
-        f"{100 * error:.1g} % too {'small' if size > 0 else 'large'}: the range of the angles is "
-        "wrong (a full turn?), "
-        "or views are missing"
+        f"{100 * abs(size):.2g} ± {100 * error:.1g} % too {'small' if size > 0 else 'large'}: the "
+        "range of the angles is wrong (a full turn?), or views are missing"
     )
 
 
 def _roll_text(size: float, error: float) -> str:
     return (
-        "opposite rays disagree, in higher rows the other way than in lower ones: the detector "
-        "is rolled by about "
-        f"{math.degrees(abs(size)):.2g} ± {math.degrees(error):.1g}° against the rotation axis"
+        "opposite rays disagree, in higher rows the other way than in lower ones: the detector is "
+        f"rolled by about {math.degrees(abs(size)):.2g} ± {math.degrees(error):.1g}° against the "
+        "rotation axis"
     )
 
 
@@ -313,14 +307,12 @@ def _mismatch_text(mismatch: float, strangers: bool, mirrored: bool) -> str:
     if mirrored:
         return (
             f"opposite rays disagree by {share}, but not with the columns counted the other way: "
-            "reverse the columns, "
-            "or the sign of the angles"
+            "reverse the columns, or the sign of the angles"
         )
     if strangers:
         return (
             f"opposite rays have little in common (they disagree by {share}): the angles of the "
-            "views (sign, range, "
-            "order), the order of the columns or the axes of the data are wrong"
+            "views (sign, range, order), the order of the columns or the axes of the data are wrong"
         )
     return (
         f"opposite rays disagree by {share}: the object moved, or the order or the angles of "
@@ -477,8 +469,7 @@ def _tested(
     if swinging < false_alarms / 2:
         findings.append(
             f"opposite rays disagree by {swing:.2f} columns to either side in the course of a "
-            "turn: the object moved, "
-            "or the angles of the views are wrong"
+            "turn: the object moved, or the angles of the views are wrong"
         )
     sizes = {"centre": fit.size} | ({} if math.isnan(swing) else {"swing": swing})
     return ScanTest(sizes, {"centre": fit.error}, tuple(findings))

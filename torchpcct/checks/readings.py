@@ -87,8 +87,8 @@ def _without_light(scan: Scan) -> list[str]:
         return []
     return [
         f"{100 * share:.2g} % of the rays leave less than {FEWEST:g} photons a reading: how dark "
-        "they are the data do "
-        "not say, and what they pass reads too low; raise the exposure, or bin the readings"
+        "they are the data do not say, and what they pass reads too low; raise the exposure, or "
+        "bin the readings"
     ]
 
 
@@ -98,8 +98,7 @@ def _no_counts(lines: NDArray[np.float64]) -> list[str]:
     if bright > 0.05:
         return [
             f"{100 * bright:.0f} % of the readings are more than 1.5 times as bright as air: air, "
-            "gain or flux are not "
-            "those of the scan, or these are line integrals given as counts "
+            "gain or flux are not those of the scan, or these are line integrals given as counts "
             "(Scan.from_line_integrals takes them)"
         ]
     quarter = lines.shape[-1] // 4
@@ -108,10 +107,8 @@ def _no_counts(lines: NDArray[np.float64]) -> list[str]:
     if ends > max(1.3 * middle + 0.1, 0.5 * float(np.nanquantile(lines[::4], 0.9))):
         return [
             f"the rays at both ends of the rows are the darkest (line integrals of {ends:.2g}, in "
-            "the middle "
-            f"{middle:.2g}): these are transmissions or counts given as line integrals, or line "
-            "integrals given as "
-            "counts"
+            f"the middle {middle:.2g}): these are transmissions or counts given as line integrals, "
+            "or line integrals given as counts"
         ]
     return []
 
@@ -128,9 +125,8 @@ def _brighter_than_air(lines: NDArray[np.float64]) -> list[str]:
         return []
     return [
         f"the rays beside the object are {100 * math.expm1(-size):.2g} % brighter than air: an "
-        "offset (dark=) or "
-        "scatter adds to the readings, or the beam is not that of the air frame (flux=); the "
-        "object reads too low"
+        "offset (dark=) or scatter adds to the readings, or the beam is not that of the air frame "
+        "(flux=); the object reads too low"
     ]
 
 
@@ -192,9 +188,8 @@ def _clipped(counts: NDArray[np.float64], quantum: float) -> list[str]:
         return []
     return [
         f"{100 * share:.2g} % of the readings stop at the highest value of their cell: the "
-        "detector is saturated, and "
-        "the thin parts of the object read too low; lower the exposure, or mask those readings by "
-        "dead="
+        "detector is saturated, and the thin parts of the object read too low; lower the "
+        "exposure, or mask those readings by dead="
     ]
 
 
@@ -249,9 +244,8 @@ def _offset(counts: NDArray[np.float64], quantum: float) -> list[str]:
         return []
     return [
         "the darkest readings have less noise than photons can have: as over an offset of "
-        f"{product / photon:.2g} (the "
-        f"darkest read {m[0]:.2g}); give dark=, and air= of the same detector, or the object "
-        "reads too low"
+        f"{product / photon:.2g} (the darkest read {m[0]:.2g}); give dark=, and air= of the same "
+        "detector, or the object reads too low"
     ]
 
 

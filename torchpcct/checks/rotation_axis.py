@@ -51,8 +51,7 @@ _UNLIKE = 0.3
 common but noise."""
 _NOTHING = (
     "the readings do not tell the axis: where it might be they are no more alike than elsewhere "
-    "(nothing but noise, or "
-    "an object that is round about the axis)"
+    "(nothing but noise, or an object that is round about the axis)"
 )
 _BLOCKS = 16
 _TIED = 1.7

@@ -176,8 +176,7 @@ def read_data_exchange(
         if frames["air"] is None:
             raise ValueError(
                 "it has no white frames, /exchange/data_white: readings cannot be normalised; "
-                "give air=, the reading "
-                "without the object"
+                "give air=, the reading without the object"
             )
         if pitch is None:
             pitch, said = _pixel_size(file)
@@ -256,8 +255,7 @@ def angles_in(data: Any, views: int, what: str, of: Any = slice(None)) -> Any:
     if 1 <= turns <= _HALF_TURNS and -0.01 <= turns * math.pi - span <= 1.5 * step:
         warnings.warn(
             f"its angles, {data.name}, have no unit and run over {span:.4g}: they are taken for "
-            f"rad, {turns} half "
-            f"turn{'s' * (turns > 1)}",
+            f"rad, {turns} half turn{'s' * (turns > 1)}",
             UserWarning,
             stacklevel=2,
         )

@@ -82,8 +82,7 @@ class ClinicalProjections(NamedTuple):
         if self.motion is not None:
             raise ValueError(
                 f"the table travels by {np.ptp(self.motion[:, 0]):.1f} mm: a helical scan has no "
-                "circular FBP. Use "
-                "recon.pwls with Projector(p.geometry, grid, motion=p.motion)"
+                "circular FBP. Use recon.pwls with Projector(p.geometry, grid, motion=p.motion)"
             )
         photons = None if self.photons is None else np.tile(self.photons, (self.geometry.rows, 1))
         return Scan.from_line_integrals(
@@ -278,8 +277,7 @@ def _from_one_spot(
         )
         raise ValueError(
             f"{folder}: its focal spot flies ({kind}) {where}: pass spot=0 for the views from the "
-            "first position, "
-            "or ignore_flying_spot=True to take it for one at rest"
+            "first position, or ignore_flying_spot=True to take it for one at rest"
         )
     return views, positions[0]
 

@@ -298,8 +298,7 @@ def read_dicom(
     if replaced:
         warnings.warn(
             f"{path}: {replaced} of {data.size} pixels are padding about the picture, not tissue, "
-            "and read as air, "
-            f"{_AIR:.0f} HU",
+            f"and read as air, {_AIR:.0f} HU",
             UserWarning,
             stacklevel=3,
         )

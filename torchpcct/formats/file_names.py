@@ -75,8 +75,7 @@ def in_number_order(paths: Sequence[Path]) -> list[Path]:
             )
             warnings.warn(
                 f"the names of {len(text)} files leave their order open: they are read as {asked} "
-                "(by the numbers), "
-                f"not as {instead}; a list of the names decides",
+                f"(by the numbers), not as {instead}; a list of the names decides",
                 UserWarning,
                 stacklevel=2,
             )

@@ -88,8 +88,7 @@ def _in_order(values: Any, geometry: Geometry, path: str | os.PathLike[str]) -> 
         ways = ", or ".join(how for how, _ in fits)
         warnings.warn(
             f"{path}: an array of {values.shape} fits the geometry {shape} in several ways "
-            f"({ways}): it is taken "
-            f"{fits[0][0]}; give its transpose, if that is wrong",
+            f"({ways}): it is taken {fits[0][0]}; give its transpose, if that is wrong",
             UserWarning,
             stacklevel=3,
         )

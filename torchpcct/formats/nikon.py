@@ -94,9 +94,8 @@ def read_xtekct(
         for name, degrees in tilts.items():
             if abs(degrees) > _STRAIGHT_DEG:
                 warnings.warn(
-                    f"{path}: the rotation axis is inclined ({name} {degrees:.3g}°), which is "
-                    "left out: give a "
-                    "VectorGeometry for it",
+                    f"{path}: the rotation axis is inclined ({name} {degrees:.3g}°), which is left "
+                    "out: give a VectorGeometry for it",
                     UserWarning,
                     stacklevel=2,
                 )

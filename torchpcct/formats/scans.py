@@ -135,10 +135,8 @@ def check_scan_name(path: str | os.PathLike[str]) -> None:
     if not (name.is_dir() or any(name.suffix.lower() in reader.endings for reader in _READERS)):
         raise ValueError(
             f"unknown scan format {name.name!r}: use .h5 (torchpcct, Data Exchange or NeXus), "
-            ".yaml (TIFF, NumPy or "
-            "MATLAB stack), .xtekct (Nikon), .txrm (Zeiss), .mat (MATLAB), .prep or .scan "
-            "(CatSim), or a folder of "
-            "DICOM-CT-PD files"
+            ".yaml (TIFF, NumPy or MATLAB stack), .xtekct (Nikon), .txrm (Zeiss), .mat (MATLAB), "
+            ".prep or .scan (CatSim), or a folder of DICOM-CT-PD files"
         )
 
 
@@ -201,8 +199,7 @@ def _reader(name: Path) -> _Reader:
             return reader
     raise ValueError(
         f"{name} is no scan of a known format: neither of torchpcct, nor Data Exchange "
-        "(/exchange/data), nor NeXus "
-        "(image_key)"
+        "(/exchange/data), nor NeXus (image_key)"
     )
 
 

@@ -35,8 +35,7 @@ def unwrapped(arrays: Mapping[str, Any], what: str) -> dict[str, Any]:
         same = [k for k, v in signed.items() if v.dtype == values.dtype]
         warnings.warn(
             f"{what}: {name} of type int{bits} reach down to {int(negative.min())}: they are read "
-            f"as uint{bits}, as a "
-            "detector counts",
+            f"as uint{bits}, as a detector counts",
             UserWarning,
             stacklevel=2,
         )

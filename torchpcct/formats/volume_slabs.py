@@ -44,8 +44,7 @@ def check_slab_name(path: str | os.PathLike[str]) -> None:
     if not str(path).endswith(SLAB_ENDINGS):
         raise ValueError(
             f"{Path(path).name!r} cannot be written slab by slab: use .nii or .zarr (OME-Zarr); "
-            ".nii.gz, .mha, .h5 and "
-            "DICOM hold what fits into memory"
+            ".nii.gz, .mha, .h5 and DICOM hold what fits into memory"
         )
 
 
@@ -87,8 +86,7 @@ class SlabFile:
             if not kept and (there.exists() or there.is_symlink()):
                 raise FileExistsError(
                     f"{there} is there and is no unfinished volume of torchpcct: move it, or name "
-                    "another file than "
-                    f"{path}"
+                    f"another file than {path}"
                 )
         _require_own(self.path)
         resumed = self.part.exists() and kept.get("key") == key
@@ -316,8 +314,7 @@ def _require_own(path: str | os.PathLike[str]) -> None:
     if foreign:
         raise FileExistsError(
             f"{folder} is a folder that holds {foreign[0]}, which torchpcct did not write there: "
-            "name another file, or "
-            "move the folder"
+            "name another file, or move the folder"
         )
 
 

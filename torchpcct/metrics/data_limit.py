@@ -65,8 +65,7 @@ def information_matrix(
         if t.shape != weight.shape:
             raise ValueError(
                 f"maps[{k}] has the shape {tuple(t.shape)}, inverse_variance "
-                f"{tuple(weight.shape)}: "
-                "compute both on the same detector window"
+                f"{tuple(weight.shape)}: compute both on the same detector window"
             )
     flat = [t.reshape(-1) for t in tensors]
     weight = weight.reshape(-1)

@@ -157,8 +157,7 @@ def noise_at_equal_resolution(
     if mask.shape != shape or mask.sum() < 2:
         raise ValueError(
             f"region must be a mask of the shape {shape} with two voxels or more, got "
-            f"{mask.shape}, "
-            f"{int(mask.sum())} voxels"
+            f"{mask.shape}, {int(mask.sum())} voxels"
         )
     part = _part(mask)
     pairs = [[v[part] for v in pair] for pair in pairs]

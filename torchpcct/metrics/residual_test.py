@@ -172,9 +172,8 @@ def residual_test(
         if p_values["centre"] < level and abs(sizes["centre"]) > CENTRE_TOLERANCE:
             findings.append(
                 f"the readings lie {abs(sizes['centre']):.2g} columns or more beside what the "
-                "volume projects to "
-                f"({abs(score):.1f} standard deviations): the rotation centre (the detector's "
-                "column offset) is wrong"
+                f"volume projects to ({abs(score):.1f} standard deviations): the rotation centre "
+                "(the detector's column offset) is wrong"
             )
 
     # Of a face along the rows voxels leave the same in all columns and views, of other steps a part
@@ -201,8 +200,8 @@ def residual_test(
             size = float((total[known] / weight[known]).square().mean().sqrt())
             findings.append(
                 f"the readings of some {name} lie above or below what the volume projects to, "
-                f"{100 * size:.2g} % of "
-                f"intensity (root mean square): {_cause(name, level_rows, level_r, lines, axes)}"
+                f"{100 * size:.2g} % of intensity (root mean square): "
+                f"{_cause(name, level_rows, level_r, lines, axes)}"
             )
     return ResidualTest(chi2, p_values, sizes, tuple(findings))
 
@@ -269,9 +268,8 @@ def _cause(name: str, w: Tensor, wr: Tensor, lines: Tensor, axes: tuple[int, int
     if dense <= _DENSE_SHARE * light:
         return gain
     return (
-        f"beam hardening by bone or metal, or scatter, as the densest rays lie {100 * dense:.2g} "
-        "% off and the others "
-        f"{100 * light:.2g} %; or {gain}"
+        f"beam hardening by bone or metal, or scatter, as the densest rays lie {100 * dense:.2g} % "
+        f"off and the others {100 * light:.2g} %; or {gain}"
     )
 
 

@@ -197,18 +197,15 @@ def _require_seen(
     if abs(step) < _SEEN * error:
         raise ValueError(
             f"the edge is lost in noise: its contrast is {step:.3g} ± {error:.2g} (standard error "
-            "over sectors): take "
-            "the mean of more realisations, or a noise-free image"
+            "over sectors): take the mean of more realisations, or a noise-free image"
         )
     at = found.f50 if math.isfinite(found.f50) else float(found.frequencies[-1])
     uncertain = float(np.interp(at, found.frequencies, _spread_of(np.array(transfers))))
     if uncertain > _UNCERTAIN:
         raise ValueError(
             f"noise hides the sharpness of the edge: at {at:.3g}/mm its transfer is uncertain by "
-            f"{uncertain:.2g} of "
-            f"the contrast (standard error over sectors, {_UNCERTAIN} at most): take the mean of "
-            "more realisations, "
-            "or a noise-free image"
+            f"{uncertain:.2g} of the contrast (standard error over sectors, {_UNCERTAIN} at most): "
+            "take the mean of more realisations, or a noise-free image"
         )
 
 

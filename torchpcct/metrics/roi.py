@@ -53,9 +53,8 @@ def _linear_weights(
     if n > 1 and (position.min() < -0.5 - 1e-6 or position.max() > n - 0.5 + 1e-6):
         raise ValueError(
             f"the image reaches {axis} = {points.min():.3f} … {points.max():.3f} mm, beyond the "
-            "volume's "
-            f"{nodes[0] - step / 2:.3f} … {nodes[-1] + step / 2:.3f} mm: reconstruct a larger "
-            "grid or move the image"
+            f"volume's {nodes[0] - step / 2:.3f} … {nodes[-1] + step / 2:.3f} mm: reconstruct a "
+            "larger grid or move the image"
         )
     position = np.clip(position, 0, n - 1)
     low = np.minimum(position.astype(np.int64), max(n - 2, 0))

@@ -160,9 +160,8 @@ class Engine:
             if not error <= _TOLERANCE[dtype]:
                 warnings.warn(
                     f"the Triton projector on {device} differs from the CPU's by {error:.1e} "
-                    "(allowed "
-                    f"{_TOLERANCE[dtype]:.0e}); the CPU's is used instead. Check the installed "
-                    "triton version.",
+                    f"(allowed {_TOLERANCE[dtype]:.0e}); the CPU's is used instead. Check the "
+                    "installed triton version.",
                     RuntimeWarning,
                     stacklevel=2,
                 )

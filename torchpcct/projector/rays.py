@@ -230,6 +230,5 @@ def check_source(place: Floats, grid: VolumeGrid) -> None:
         )
         raise ValueError(
             f"the source of view {view} at {x} mm lies inside the grid of {extent} mm about "
-            f"{center} mm: shrink or "
-            "move the grid, or move the source away (a larger sod)"
+            f"{center} mm: shrink or move the grid, or move the source away (a larger sod)"
         )

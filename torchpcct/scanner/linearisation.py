@@ -170,8 +170,7 @@ class WaterLinearisation:
             if tuple(p.shape[-3:-1]) != (window.views, window.rows):
                 raise ValueError(
                     f"p must have the shape (..., {window.views}, {window.rows}, {columns}) on "
-                    "this window, "
-                    f"got {tuple(p.shape)}"
+                    f"this window, got {tuple(p.shape)}"
                 )
             if int(window.first_column.max()) + columns > self.scale.size:
                 raise ValueError(

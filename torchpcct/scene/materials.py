@@ -55,10 +55,9 @@ _KINDS = ("total", "photo", "incoh", "coh")
 # material needs no table.
 _SYMBOLS = (
     "H He Li Be B C N O F Ne Na Mg Al Si P S Cl Ar K Ca Sc Ti V Cr Mn Fe Co Ni Cu Zn Ga Ge As Se "
-    "Br Kr Rb Sr Y Zr Nb "
-    "Mo Tc Ru Rh Pd Ag Cd In Sn Sb Te I Xe Cs Ba La Ce Pr Nd Pm Sm Eu Gd Tb Dy Ho Er Tm Yb Lu Hf "
-    "Ta W Re Os Ir Pt Au "
-    "Hg Tl Pb Bi Po At Rn Fr Ra Ac Th Pa U Np Pu Am Cm Bk Cf"
+    "Br Kr Rb Sr Y Zr Nb Mo Tc Ru Rh Pd Ag Cd In Sn Sb Te I Xe Cs Ba La Ce Pr Nd Pm Sm Eu Gd Tb "
+    "Dy Ho Er Tm Yb Lu Hf Ta W Re Os Ir Pt Au Hg Tl Pb Bi Po At Rn Fr Ra Ac Th Pa U Np Pu Am Cm "
+    "Bk Cf"
 )
 _ELEMENTS = frozenset(_SYMBOLS.split())
 
@@ -153,8 +152,7 @@ class Material:
         if abs(total - 1.0) > FRACTION_TOLERANCE:
             raise ValueError(
                 f"mass fractions of {self.name!r} sum to {total:.4f}, not 1 ± "
-                f"{FRACTION_TOLERANCE}: "
-                "give fractions (not per cent) of every element"
+                f"{FRACTION_TOLERANCE}: give fractions (not per cent) of every element"
             )
         if abs(total - 1.0) < 1e-12:
             total = 1.0  # rounding only: leave the values as they are, so that copies compare equal
@@ -502,7 +500,6 @@ def material(value: Material | str) -> Material:
     if value not in MATERIALS:
         raise ValueError(
             f"unknown material {value!r}: use a Material, one of {', '.join(sorted(MATERIALS))}, "
-            "or a concentration "
-            "such as 'iodine 10 mg/ml in blood'"
+            "or a concentration such as 'iodine 10 mg/ml in blood'"
         )
     return MATERIALS[value]

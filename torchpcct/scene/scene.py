@@ -99,8 +99,7 @@ class Scene:
             if body.parent is not None and body.parent not in index:
                 raise ValueError(
                     f"body {body.name!r}: its parent {body.parent!r} is not among the bodies "
-                    "before it "
-                    f"({', '.join(index) or 'none'}): list parents before their children"
+                    f"before it ({', '.join(index) or 'none'}): list parents before their children"
                 )
             index[body.name] = k
         self._index = index
@@ -265,9 +264,8 @@ class Scene:
             worst = int(level.argmax())
             if level[worst] > 1.0 + _TOUCH:
                 raise ValueError(
-                    f"body {self.bodies[k].name!r} leaves its parent {parent.name!r}, for "
-                    "instance at "
-                    f"(x, y, z) = {_format(surface[worst] + shift)} mm: move it, shrink it or "
+                    f"body {self.bodies[k].name!r} leaves its parent {parent.name!r}, for instance "
+                    f"at (x, y, z) = {_format(surface[worst] + shift)} mm: move it, shrink it or "
                     "name another parent"
                 )
 

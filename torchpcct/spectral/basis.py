@@ -56,8 +56,7 @@ class Basis:
         if np.ptp(ratio) < 1e-3 * ratio.mean():
             raise ValueError(
                 f"{self.first.name!r} and {self.second.name!r} attenuate alike at every energy: "
-                "choose basis "
-                "materials of different atomic numbers, such as polyethylene and pvc"
+                "choose basis materials of different atomic numbers, such as polyethylene and pvc"
             )
 
     @property

@@ -187,8 +187,7 @@ def _check_bins(counts: Any, model: SpectralModel, column: Any) -> None:
         if (counts[b] * silent[column, b] > 0).any():
             raise ValueError(
                 f"bin {b} counted photons in a column where the model expects none: build the "
-                "model from the scanner "
-                "and the thresholds of the scan"
+                "model from the scanner and the thresholds of the scan"
             )
     share = float(one_bin(counts).mean()) if counts.shape[1] else 0.0
     if share < NAMED:

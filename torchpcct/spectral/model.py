@@ -90,8 +90,7 @@ class SpectralModel:
         if spectra.shape[1] < 2:
             raise ValueError(
                 f"two basis materials need at least 2 energy bins, got {spectra.shape[1]}: use a "
-                "spectral "
-                "detector, such as presets.pcct(mode='spectral')"
+                "spectral detector, such as presets.pcct(mode='spectral')"
             )
         if not (
             np.isfinite(spectra).all() and (spectra >= 0).all() and (spectra.sum((1, 2)) > 0).all()
@@ -102,9 +101,8 @@ class SpectralModel:
         if (alike := _one_spectrum(spectra)).any():
             raise ValueError(
                 f"the bins of column {int(alike.argmax())} have one spectrum but for its height, "
-                "or counts in one bin "
-                "only: they cannot tell two materials apart; set other thresholds, or leave dead "
-                "columns out"
+                "or counts in one bin only: they cannot tell two materials apart; set other "
+                "thresholds, or leave dead columns out"
             )
         if (starved := one_bin(spectra.sum(-1).T)).any():
             column = int(starved.argmax())
@@ -114,10 +112,8 @@ class SpectralModel:
             )
             raise ValueError(
                 f"of column {column} one bin is expected to count {strongest:.3g} photons in air "
-                "and all others "
-                f"together {others:.2g}: they cannot tell two materials apart; set lower "
-                "thresholds, or a higher tube "
-                "voltage"
+                f"and all others together {others:.2g}: they cannot tell two materials apart; set "
+                "lower thresholds, or a higher tube voltage"
             )
         # Energies that no column detects cost time, and where the model is asked for negative
         # lengths they matter.
@@ -150,8 +146,8 @@ class SpectralModel:
         if scanner.detector.energy_integrating or scanner.detector.bins < 2:
             raise ValueError(
                 f"{scanner.name!r} reads {scanner.detector.bins} bin(s): material decomposition "
-                "needs photon counts in "
-                "at least 2 energy bins, such as presets.pcct(mode='spectral')"
+                "needs photon counts in at least 2 energy bins, such as "
+                "presets.pcct(mode='spectral')"
             )
         energies, weights = scanner.weights()
         spectra = np.moveaxis(weights, 0, 1) * scanner.mas_per_view(exposure_s)
@@ -234,15 +230,15 @@ class SpectralModel:
         if tuple(scan.air.shape) != tuple(air.shape):
             raise ValueError(
                 f"the scan's air readings have the shape {tuple(scan.air.shape)}, the model's "
-                "(bins, rows, columns) "
-                f"are {tuple(air.shape)}: build the model from the scanner of the scan"
+                f"(bins, rows, columns) are {tuple(air.shape)}: build the model from the scanner "
+                "of the scan"
             )
         error = float((scan.air / air - 1).abs().max())
         if error > 1e-3:
             raise ValueError(
                 f"air counts of scan and model differ by up to {100 * error:.3g} %: build the "
-                "model with the scanner "
-                "of the scan and its exposure (for a noise-free scan NOISE_FREE_EXPOSURE_S)"
+                "model with the scanner of the scan and its exposure (for a noise-free scan "
+                "NOISE_FREE_EXPOSURE_S)"
             )
         w = scan.window
         factor = torch.from_numpy(self.row_factor)[:, None]

@@ -165,8 +165,7 @@ def vmi_curve(
     if a.shape != (2,) or b.shape != (2,) or c.shape != (3,):
         raise ValueError(
             "first and second must hold 2 coefficients, covariance 3 values, got the shapes "
-            f"{a.shape}, {b.shape} "
-            f"and {c.shape}"
+            f"{a.shape}, {b.shape} and {c.shape}"
         )
     det = c[0] * c[2] - c[1] ** 2
     if not (c[0] > 0 and c[2] > 0 and det > 0):

@@ -76,8 +76,7 @@ def held_out_plaques(
         if not core_roi.any() or not fibrous_roi.any():
             raise ValueError(
                 f"grid {shape} at {voxel_mm:g} mm leaves no voxel wholly inside core or fibrous "
-                "tissue of "
-                f"plaque {index}: take smaller voxels or a larger inset"
+                f"tissue of plaque {index}: take smaller voxels or a larger inset"
             )
         each = np.stack([base + contrast * weight for contrast in contrasts])
         found.append((each, weight, core_roi.astype(np.float32), fibrous_roi.astype(np.float32)))

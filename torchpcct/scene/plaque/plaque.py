@@ -112,8 +112,7 @@ class Plaque:
         if 2 * self.wall_thickness >= self.vessel_diameter:
             raise ValueError(
                 f"wall_thickness ({self.wall_thickness:g} mm) must be less than half of "
-                "vessel_diameter "
-                f"({self.vessel_diameter:g} mm)"
+                f"vessel_diameter ({self.vessel_diameter:g} mm)"
             )
 
     @property
@@ -273,8 +272,7 @@ def interpolate_material(name: str, start: Any, end: Any, weight: float) -> Mate
         if value < -1e-12:
             raise ValueError(
                 f"weight {w:g} between {a.name!r} and {b.name!r} needs a negative amount of "
-                f"{element}: "
-                "choose one closer to 0…1"
+                f"{element}: choose one closer to 0…1"
             )
         if value > 0:
             partial[element] = value
