@@ -107,15 +107,7 @@ def bin_weights(
         TypeError: values of the wrong kind.
     """
     counted, change, names, paths = _photons(scanner, contrast, behind)
-    counts, signal = counted.sum(-1), counted @ change
-    per_photon = signal / counts
-    # Of the two signs that whose bins hold more; with independent bins the others weigh nothing.
-    positive, negative = (
-        (np.maximum(sign * per_photon, 0.0) ** 2 * counts).sum(0) for sign in (1.0, -1.0)
-    )
-    best = np.maximum(np.where(positive >= negative, 1.0, -1.0) * per_photon, 0.0)
-    best *= counts.sum(0) / (best * counts).sum(0)
-    return BinWeights(best, scanner, names, paths)
+    return BinWeights(_best(counted.sum(-1), counted @ change), scanner, names, paths)
 
 
 @checked
@@ -147,7 +139,7 @@ def weighting_gain(
         if choice("weights", weights, ("bins", "energies")) == "energies":
             photons = counted.sum(0)
             return np.asarray((photons @ change**2) * photons.sum(-1) / np.square(photons @ change))
-        weights = bin_weights(scanner, contrast, behind)
+        weights = _best(counts, signal)
     w = _values(weights, counts.shape)
     return np.asarray(
         np.square((w * signal).sum(0) / signal.sum(0)) * counts.sum(0) / (w**2 * counts).sum(0)
@@ -235,6 +227,19 @@ def _photons(
             "leave its threshold out of the detector, or set a higher tube voltage"
         )
     return counted, change, (first.name, second.name), {m.name: t for m, t in paths.items()}
+
+
+def _best(counts: Floats, signal: Floats) -> Floats:
+    """Weights ``(bins, columns)`` ≥ 0 of the least relative noise, with the mean 1 over the counts;
+    both arguments of that shape."""
+    per_photon = signal / counts
+    # Of the two signs that whose bins hold more; with independent bins the others weigh nothing.
+    positive, negative = (
+        (np.maximum(sign * per_photon, 0.0) ** 2 * counts).sum(0) for sign in (1.0, -1.0)
+    )
+    best = np.maximum(np.where(positive >= negative, 1.0, -1.0) * per_photon, 0.0)
+    best *= counts.sum(0) / (best * counts).sum(0)
+    return best
 
 
 def _require_bins(scanner: Scanner) -> None:
