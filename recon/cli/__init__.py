@@ -23,6 +23,7 @@ from recon.cli.measuring import (
     add_dose_factor,
     add_evaluate,
     add_hardcases,
+    add_recovery,
     add_show_task,
     add_study,
     add_verify,
@@ -58,7 +59,7 @@ _GROUPS = {
         add_train,
     ),
     "look": (add_view, add_info),
-    "measure": (add_evaluate, add_show_task, add_plaque),
+    "measure": (add_evaluate, add_recovery, add_show_task, add_plaque),
     "studies": (add_compare, add_dose_factor, add_hardcases, add_study, add_verify),
 }
 _BEGIN = """\

@@ -54,7 +54,15 @@ if TYPE_CHECKING:
     from torchpcct.acquisition.config import SimulationConfig
     from torchpcct.scene.voxels import VoxelScene
 
-__all__ = ["add_lower_dose", "add_reconstruct", "add_show_config", "add_simulate", "grid_of_scan"]
+__all__ = [
+    "add_lower_dose",
+    "add_reader_options",
+    "add_reconstruct",
+    "add_show_config",
+    "add_simulate",
+    "grid_of_scan",
+    "reader_options",
+]
 
 _PAPER_VIEWS = 1968
 """Views of a turn in the paper."""
@@ -284,8 +292,8 @@ def _slices(text: str) -> slice:
     return slice(first, stop)
 
 
-def _add_reader_options(parser: Parser, many: bool = False) -> None:
-    """The scan, or many of them, and what its file may not know, see :func:`_reader_options`."""
+def add_reader_options(parser: Parser, many: bool = False) -> None:
+    """The scan, or many of them, and what its file may not know, see :func:`reader_options`."""
     nargs = {"nargs": "+"} if many else {"read": True}
     formats = (
         ".h5 (ours, Data Exchange, NeXus), .yaml stack, .xtekct, .txrm, .mat, CatSim, "
@@ -407,7 +415,8 @@ _READ_WITH = (
 )
 
 
-def _reader_options(arguments: argparse.Namespace) -> dict[str, Any]:
+def reader_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What the command line says of the scan's file beside it."""
     given = {name: getattr(arguments, name) for name in _READ_WITH}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if arguments.slices is not None:
@@ -659,7 +668,7 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
     if slabs:
         _reconstruct_slabs(arguments, options, progress)
         return
-    scan = open_scan(arguments.scan, **_reader_options(arguments))
+    scan = open_scan(arguments.scan, **reader_options(arguments))
     if arguments.find_axis:
         from torchpcct.formats.preprocess import centred, find_axis
 
@@ -756,7 +765,7 @@ def _reconstruct_slabs(
                 f"--{name.replace('_', '-')} is not done slab by slab: {remedy} or leave out "
                 "--memory"
             )
-    reader = _reader_options(arguments)
+    reader = reader_options(arguments)
     if reader.pop("slices", None) is not None:
         raise ValueError(
             "--memory takes all slices of the scan: leave out --slices, or reconstruct those "
@@ -913,7 +922,7 @@ def add_reconstruct(commands: Commands) -> None:
         ),
         group="voxels",
     )
-    _add_reader_options(parser, many=True)
+    add_reader_options(parser, many=True)
     add_options(
         parser,
         (
@@ -940,7 +949,7 @@ def _lower_dose(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     from torchpcct.formats.geometry_yaml import geometry_values
     from torchpcct.formats.scans import open_scan
 
-    scan = open_scan(arguments.scan, **_reader_options(arguments)).at_dose(
+    scan = open_scan(arguments.scan, **reader_options(arguments)).at_dose(
         arguments.fraction, arguments.seed
     )
     scan.save(arguments.out)
@@ -977,7 +986,7 @@ def add_lower_dose(commands: Commands) -> None:
         "torchpcct lower-dose scan.h5 --fraction 0.25 --out quarter.h5",
         out="HDF5 file to write (default SCAN_FRACTION.h5)",
     )
-    _add_reader_options(parser)
+    add_reader_options(parser)
     limits = {"positive": True, "high": 1.0}
     add_options(
         parser,

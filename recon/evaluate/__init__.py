@@ -6,7 +6,8 @@ image?
 realisations (:mod:`~recon.evaluate.draws`), reads the volumes (:mod:`~recon.evaluate.measure`) and
 gives figures with intervals (:mod:`~recon.evaluate.estimates`), of which :func:`save` makes a
 report. What every method has to beat is in :mod:`~recon.evaluate.rivals`: the strongest simple
-filters of a volume. Where nobody knows the truth: :func:`evaluate_scans`.
+filters of a volume. Where nobody knows the truth: :func:`evaluate_scans`, and
+:func:`contrast_recovery`, what a method would show of a lesion in a given scan.
 
 Your denoiser on a lung nodule:
 
@@ -21,6 +22,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from recon.evaluate.experiment import Evaluation, evaluate, export_scans
+    from recon.evaluate.insertion import (
+        ContrastRecovery,
+        InsertedBall,
+        contrast_recovery,
+    )
     from recon.evaluate.methods import Method, deepinv_denoiser, denoiser, method_of
     from recon.evaluate.names import TASKS
     from recon.evaluate.report import save
@@ -30,9 +36,12 @@ if TYPE_CHECKING:
 
 __all__ = [
     "TASKS",
+    "ContrastRecovery",
     "Evaluation",
+    "InsertedBall",
     "Method",
     "Task",
+    "contrast_recovery",
     "deepinv_denoiser",
     "denoiser",
     "evaluate",
@@ -45,6 +54,7 @@ __all__ = [
 ]
 
 _SOURCES = {
+    "insertion": ("ContrastRecovery", "InsertedBall", "contrast_recovery"),
     "experiment": ("Evaluation", "evaluate", "export_scans"),
     "names": ("TASKS",),
     "methods": ("Method", "deepinv_denoiser", "denoiser", "method_of"),

@@ -606,10 +606,4 @@ def with_painted(scan: Scan, inset: VolumeGrid, painted: Callable[[VolumeGrid], 
     added."""
     fine = VolumeGrid(tuple(2 * n for n in inset.shape), inset.spacing[0] / 2, inset.center)
     mu = torch.from_numpy(painted(fine) * (scan.linearisation.mu_ref / 1000.0)).float()
-    added = Projector(scan.geometry, fine, scan.window)(mu)
-    p = scan._at_window(scan.air.log()) - scan.counts.log()
-    # One Newton step of the linearisation: what is added is a few per cent of what is there.
-    half = p + 0.5 * added / scan.linearisation.slope(p, scan.window)
-    return replace(
-        scan, counts=scan.counts * (-added / scan.linearisation.slope(half, scan.window)).exp()
-    )
+    return scan.with_added(Projector(scan.geometry, fine, scan.window)(mu))

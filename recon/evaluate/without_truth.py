@@ -141,11 +141,7 @@ def evaluate_scans(
         raise ValueError(
             "views can be exchanged between scans of one exposure only: these have two; leave out n"
         )
-    if grid.ndim == 2:  # filters work on volumes
-        given = [
-            replace(s, air=s.air[None], **s.each(lambda readings: readings[None])) for s in given
-        ]
-        grid = VolumeGrid((1, *grid.shape), (grid.spacing[0], *grid.spacing), (0.0, *grid.center))
+    given, grid = [as_slices(s, grid)[0] for s in given], as_slices(given[0], grid)[1]
     names = [method_of(m) for m in (methods if isinstance(methods, list | tuple) else [methods])]
     weighted = [m.name for m in names if m.energies is not None]
     if weighted:
@@ -161,6 +157,17 @@ def evaluate_scans(
         measured = evaluate_volumes(found, reference, grid.spacing, region)
         rows.append([{**row, "note": _note(given[0], grid)} for row in measured])
     return rows[0] if n == 1 else [_mean(list(same)) for same in zip(*rows, strict=True)]
+
+
+def as_slices(scan: Scan, grid: VolumeGrid) -> tuple[Scan, VolumeGrid]:
+    """A scan of one slice and its grid ``(y, x)`` as a stack of one, ``(1, y, x)``: filters work on
+    volumes. Others as they are."""
+    if grid.ndim == 3:
+        return scan, grid
+    stack = replace(scan, air=scan.air[None], **scan.each(lambda readings: readings[None]))
+    return stack, VolumeGrid(
+        (1, *grid.shape), (grid.spacing[0], *grid.spacing), (0.0, *grid.center)
+    )
 
 
 def _exchanged(pair: Sequence[Scan], draw: np.random.Generator) -> list[Scan]:

@@ -26,10 +26,11 @@ from recon.evaluate.tasks import with_painted, without_inset
 from recon.jobs.execute import heard
 from recon.jobs.store import Pieces
 from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.recovery import recovered_contrast
 from torchpcct.scan import Scan
 from torchpcct.volume import Volume
 
-__all__ = ["LEAST_RECOVERY", "METHODS", "anatomy_rows", "anatomy_verdict", "recovery"]
+__all__ = ["LEAST_RECOVERY", "METHODS", "anatomy_rows", "anatomy_verdict"]
 
 LEAST_RECOVERY = 0.9
 """Share of what soft FBP recovers of a feature's contrast that a method may not fall below without
@@ -40,22 +41,11 @@ METHODS = ("pwls", "mbir", "mbir:vessel")
 Reconstruct = Callable[[Scan, VolumeGrid, str], Volume]
 
 
-def recovery(shown: Tensor, truth: Tensor) -> float:
-    """Share of a feature's contrast that a difference of two volumes shows.
-
-    Args:
-        shown: a volume with the feature less one without it, HU.
-        truth: the same of the scenes, HU.
-    """
-    where = truth.abs() > 0.5 * float(truth.abs().max())
-    return float((shown * truth.sign())[where].mean() / truth.abs()[where].mean())
-
-
 def anatomy_verdict(recovered: float | None, soft: float, messages: Sequence[str]) -> str:
     """``right``, ``warned`` (less than soft FBP shows, or refused, with a message) or ``SILENT``.
 
     Args:
-        recovered: see :func:`recovery`; None: refused.
+        recovered: see :func:`torchpcct.metrics.recovery.recovered_contrast`; None: refused.
         soft: of soft FBP.
         messages: of the volume with the feature beside those of the volume without it, and what
             says that a vessel was drawn.
@@ -137,7 +127,7 @@ def _recovered(
     reconstruct: Reconstruct,
     kind: Callable[[str], str],
 ) -> tuple[float | None, list[str]]:
-    """Mean :func:`recovery` over pairs of scans, None if one is refused, and the messages."""
+    """Mean contrast recovery over pairs of scans, None if one is refused, and the messages."""
     found, said = [], []
     for pair in pairs:
         volumes, texts = [], []
@@ -152,7 +142,7 @@ def _recovered(
         usual = set(map(kind, texts[1]))
         # A drawing says of itself what it may leave out, whatever it draws.
         said += [t for t in texts[0] if kind(t) not in usual or "was drawn, and disease" in t]
-        found.append(recovery(volumes[0] - volumes[1], truth))
+        found.append(recovered_contrast(volumes[0] - volumes[1], truth))
     return float(np.mean(found)), list(dict.fromkeys(said))
 
 

@@ -4,9 +4,10 @@ import pytest
 import torch
 
 from recon.evaluate.anatomies import ANATOMIES
-from recon.study.hardcases.anatomies import METHODS, _painted, anatomy_verdict, recovery
+from recon.study.hardcases.anatomies import METHODS, _painted, anatomy_verdict
 from recon.study.hardcases.measure import Settings
 from torchpcct.geometry import VolumeGrid
+from torchpcct.metrics.recovery import recovered_contrast
 
 CENTER = (1.0, -30.0, 20.0)
 
@@ -23,10 +24,10 @@ def test_recovery_is_the_share_of_the_contrast_where_the_feature_is():
     truth = torch.zeros(4, 6, 6)
     truth[1:3, 2:4, 2:4] = -90.0
     truth[0, 0, 0] = -40.0  # a voxel that it hardly changes
-    assert recovery(truth, truth) == pytest.approx(1.0)
-    assert recovery(0.4 * truth + (truth == 0), truth) == pytest.approx(0.4)
-    assert recovery(torch.zeros_like(truth), truth) == 0.0
-    assert recovery(-truth, truth) == pytest.approx(-1.0)
+    assert recovered_contrast(truth, truth) == pytest.approx(1.0)
+    assert recovered_contrast(0.4 * truth + (truth == 0), truth) == pytest.approx(0.4)
+    assert recovered_contrast(torch.zeros_like(truth), truth) == 0.0
+    assert recovered_contrast(-truth, truth) == pytest.approx(-1.0)
 
 
 def test_the_feature_lies_in_the_middle_of_the_inset():
