@@ -16,7 +16,7 @@ Other kernels that need random numbers take them from here too: :func:`seed_key`
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -25,6 +25,14 @@ from torch import Tensor
 
 from torchpcct.threads import run
 from torchpcct.validate import number
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import ArrayLike
+
+    from torchpcct.typing import Ints, Reals
+
 
 __all__ = [
     "compound_poisson",
@@ -65,20 +73,20 @@ _RARE = 1e-6
 
 
 @njit(inline="always", cache=True)
-def _mix(z: Any) -> Any:
+def _mix(z: np.uint64) -> np.uint64:
     z = (z ^ (z >> _S30)) * _MIX1
     z = (z ^ (z >> _S27)) * _MIX2
     return z ^ (z >> _S31)
 
 
 @njit(inline="always", cache=True)
-def stream(key: Any, index: Any) -> Any:
+def stream(key: np.uint64, index: int) -> np.uint64:
     """State at which the random stream of an index begins, for a key of :func:`seed_key`."""
     return _mix(key ^ _mix(np.uint64(index) * _GOLDEN + _MIX2))
 
 
 @njit(inline="always", cache=True)
-def draw(state: Any) -> Any:
+def draw(state: np.uint64) -> tuple[np.uint64, float]:
     """Next state of a stream and a uniform number in the open interval (0, 1)."""
     state = state + _GOLDEN
     # The largest of them is rounded up to 1 before it is scaled.
@@ -86,14 +94,14 @@ def draw(state: Any) -> Any:
 
 
 @njit(inline="always", cache=True)
-def _normal_one(state: Any) -> float:
+def _normal_one(state: np.uint64) -> float:
     state, u = draw(state)
     state, v = draw(state)
     return math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * v)
 
 
 @njit(cache=True)
-def _poisson_one(mean: float, state: Any) -> float:
+def _poisson_one(mean: float, state: np.uint64) -> float:
     # Whole numbers stay floats: math.floor gives int64, which ends at 9e18.
     if mean >= _NORMAL:
         return np.floor(mean + math.sqrt(mean) * _normal_one(state) + 0.5)
@@ -129,7 +137,7 @@ def _poisson_one(mean: float, state: Any) -> float:
 
 
 @njit(cache=True)
-def _binomial_one(n: float, p: float, state: Any) -> float:
+def _binomial_one(n: float, p: float, state: np.uint64) -> float:
     """Of ``n`` events those that happen, each with the probability ``p`` ≤ ½."""
     q = 1.0 - p
     ratio = p / q
@@ -171,7 +179,7 @@ def _binomial_one(n: float, p: float, state: Any) -> float:
 
 @njit(nogil=True, cache=True)
 def _thinned_rows(
-    begin: int, end: int, counts: Any, first: Any, fraction: float, key: Any, out: Any
+    begin: int, end: int, counts: Reals, first: Ints, fraction: float, key: np.uint64, out: Reals
 ) -> None:
     for i in range(begin, end):
         for j in range(counts.shape[1]):
@@ -194,7 +202,7 @@ def _thinned_rows(
 
 @njit(nogil=True, cache=True)
 def _split_rows(
-    begin: int, end: int, counts: Any, chance: Any, first: Any, key: Any, out: Any
+    begin: int, end: int, counts: Reals, chance: Reals, first: Ints, key: np.uint64, out: Reals
 ) -> None:
     for i in range(begin, end):
         for j in range(counts.shape[1]):
@@ -211,7 +219,7 @@ def _split_rows(
 
 @njit(nogil=True, cache=True)
 def _poisson_rows(
-    begin: int, end: int, mean: Any, first: Any, scale: float, key: Any, out: Any
+    begin: int, end: int, mean: Reals, first: Ints, scale: float, key: np.uint64, out: Reals
 ) -> None:
     for i in range(begin, end):
         for j in range(mean.shape[1]):
@@ -225,7 +233,7 @@ def _poisson_rows(
 
 
 @njit(nogil=True, cache=True)
-def _normal_rows(begin: int, end: int, first: Any, key: Any, out: Any) -> None:
+def _normal_rows(begin: int, end: int, first: Ints, key: np.uint64, out: Reals) -> None:
     for i in range(begin, end):
         for j in range(out.shape[1]):
             out[i, j] = _normal_one(stream(key, first[i] + j))
@@ -233,7 +241,14 @@ def _normal_rows(begin: int, end: int, first: Any, key: Any, out: Any) -> None:
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _compound_rows(
-    begin: int, end: int, mean: Any, quantum: Any, first: Any, scale: float, key: Any, out: Any
+    begin: int,
+    end: int,
+    mean: Reals,
+    quantum: Reals,
+    first: Ints,
+    scale: float,
+    key: np.uint64,
+    out: Reals,
 ) -> None:
     for i in range(begin, end):
         for j in range(mean.shape[1]):
@@ -259,7 +274,7 @@ _SPLIT = 4
 """This and all after it: of the bins of :func:`split`."""
 
 
-def seed_key(seed: int, purpose: int = _QUANTA) -> Any:
+def seed_key(seed: int, purpose: int = _QUANTA) -> np.uint64:
     """Key of a seed's streams; ``TypeError`` or ``ValueError`` unless the seed is a whole number
     in 0 … 2**63 − 1."""
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
@@ -271,7 +286,7 @@ def seed_key(seed: int, purpose: int = _QUANTA) -> Any:
         return np.uint64(_mix.py_func(start + np.uint64(purpose >> 1) * _MIX2))
 
 
-def _first(first: Any, rows: int) -> Any:
+def _first(first: ArrayLike, rows: int) -> Ints:
     given = np.asarray(first)
     if given.dtype.kind not in "iu" and given.size:
         raise TypeError(f"first_index must hold whole numbers, got {given.dtype}")
@@ -292,7 +307,12 @@ def _like(name: str, values: Tensor, other: str, like: Tensor) -> None:
         )
 
 
-def _drawn(kernel: Any, readings: tuple[Tensor, ...], first_index: Any, *parameters: Any) -> Tensor:
+def _drawn(
+    kernel: Callable[..., None],
+    readings: tuple[Tensor, ...],
+    first_index: ArrayLike,
+    *parameters: object,
+) -> Tensor:
     """What a kernel draws for readings ``(..., n)``, of the shape and dtype of the first."""
     like = readings[0]
     for values in readings:
@@ -316,7 +336,7 @@ def _drawn(kernel: Any, readings: tuple[Tensor, ...], first_index: Any, *paramet
     return out.reshape(shape)
 
 
-def poisson(mean: Tensor, first_index: Any, seed: int, scale: float = 1.0) -> Tensor:
+def poisson(mean: Tensor, first_index: ArrayLike, seed: int, scale: float = 1.0) -> Tensor:
     """Poisson counts with expectation ``scale * mean``.
 
     Args:
@@ -342,7 +362,7 @@ def poisson(mean: Tensor, first_index: Any, seed: int, scale: float = 1.0) -> Te
 def compound_poisson(
     mean: Tensor,
     quantum: Tensor,
-    first_index: Any,
+    first_index: ArrayLike,
     seed: int,
     scale: float = 1.0,
     electronic: float = 0.0,
@@ -385,7 +405,7 @@ def compound_poisson(
 
 def thinned(
     counts: Tensor,
-    first_index: Any,
+    first_index: ArrayLike,
     seed: int,
     fraction: float,
     quantum: Tensor | None = None,
@@ -431,7 +451,7 @@ def thinned(
     return out
 
 
-def split(counts: Tensor, expected: Tensor, first_index: Any, seed: int) -> Tensor:
+def split(counts: Tensor, expected: Tensor, first_index: ArrayLike, seed: int) -> Tensor:
     """Counts of energy bins whose sum is given: multinomial with the shares that the bins have of
     the expected counts.
 
@@ -473,7 +493,7 @@ def split(counts: Tensor, expected: Tensor, first_index: Any, seed: int) -> Tens
 
 def normal(
     shape: tuple[int, ...],
-    first_index: Any,
+    first_index: ArrayLike,
     seed: int,
     dtype: torch.dtype = torch.float32,
     purpose: int = _QUANTA,

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -166,7 +166,7 @@ def _exp(x: float) -> float:
 
 
 @njit(cache=True, fastmath=_FAST, error_model="numpy")
-def _moments(samples: Any, count: int, lanes: int, mean: Any, spread: Any) -> None:
+def _moments(samples: Floats, count: int, lanes: int, mean: Floats, spread: Floats) -> None:
     """Mean ``(rank, lanes)`` and covariance, ``(pairs, lanes)`` with both of a mixed pair, of
     ``samples (count, rank, lanes)``; samples become deviations from the first one."""
     rank = samples.shape[1]
@@ -204,7 +204,14 @@ def _moments(samples: Any, count: int, lanes: int, mean: Any, spread: Any) -> No
 
 @njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _transmitted(
-    samples: Any, count: int, lanes: int, mean: Any, spread: Any, basis: Any, e: int, out: Any
+    samples: Floats,
+    count: int,
+    lanes: int,
+    mean: Floats,
+    spread: Floats,
+    basis: Floats,
+    e: int,
+    out: Floats,
 ) -> None:
     """Mean transmission of each reading at energy ``e``: to second order, or the full sum."""
     rank = basis.shape[0]
@@ -245,30 +252,30 @@ def _transmitted(
 def _readings(
     begin: int,
     end: int,
-    cos_b: Any,
-    sin_b: Any,
-    view_step: Any,
+    cos_b: Floats,
+    sin_b: Floats,
+    view_step: Floats,
     sod: float,
-    across: Any,
+    across: Floats,
     v0: float,
     dv: float,
     focal_w: float,
     focal_l: float,
-    points: Any,
-    kinds: Any,
-    params: Any,
-    coefficients: Any,
-    basis: Any,
-    offsets: Any,
-    drift: Any,
-    circle: Any,
+    points: Floats,
+    kinds: NDArray[np.int64],
+    params: Floats,
+    coefficients: Floats,
+    basis: Floats,
+    offsets: Floats,
+    drift: Floats,
+    circle: Floats,
     reach: float,
-    spectra: Any,
-    row_factor: Any,
-    first_column: Any,
+    spectra: Floats,
+    row_factor: Floats,
+    first_column: NDArray[np.int64],
     first_row: int,
-    surround: Any,
-    out: Any,
+    surround: Floats,
+    out: Floats,
 ) -> None:
     bins, _, rows, columns = out.shape
     rank, energies = basis.shape

@@ -7,13 +7,19 @@ the same bit for bit for any number of threads.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numba
 
 from torchpcct.counting_noise import draw, stream
 from torchpcct.kernel_cache import forget_outdated
 from torchpcct.scanner.compton import ELECTRON_REST_KEV
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from torchpcct.typing import Floats, Ints
+
 
 __all__ = ["BATCHES", "transport"]
 
@@ -23,7 +29,7 @@ _KEV_ANGSTROM = 12.398419843
 
 
 @numba.njit(inline="always", cache=True)
-def _find(cumulative: Any, value: float) -> int:
+def _find(cumulative: Floats, value: float) -> int:
     """Smallest k with ``cumulative[k] > value``."""
     low, high = 0, cumulative.size - 1
     while low < high:
@@ -36,7 +42,7 @@ def _find(cumulative: Any, value: float) -> int:
 
 
 @numba.njit(inline="always", cache=True)
-def _compton(energy: float, state: Any) -> Any:
+def _compton(energy: float, state: np.uint64) -> tuple[np.uint64, float, float]:
     """Scattered energy and cosine after Klein and Nishina (Kahn's rejection, as in Butcher and
     Messel)."""
     k = energy / ELECTRON_REST_KEV
@@ -58,7 +64,9 @@ def _compton(energy: float, state: Any) -> Any:
 
 
 @numba.njit(inline="always", cache=True)
-def _rayleigh(energy: float, squares: Any, cumulative: Any, state: Any) -> Any:
+def _rayleigh(
+    energy: float, squares: Floats, cumulative: Floats, state: np.uint64
+) -> tuple[np.uint64, float]:
     """Cosine of coherent scatter: x² from the squared form factor up to its kinematic end, then
     (1 + cos²) / 2."""
     end = (energy / _KEV_ANGSTROM) ** 2
@@ -78,7 +86,9 @@ def _rayleigh(energy: float, squares: Any, cumulative: Any, state: Any) -> Any:
 
 
 @numba.njit(inline="always", cache=True)
-def _turned(dx: float, dy: float, dz: float, cosine: float, phi: float) -> Any:
+def _turned(
+    dx: float, dy: float, dz: float, cosine: float, phi: float
+) -> tuple[float, float, float]:
     """Unit direction at the polar angle arccos(cosine) and the azimuth phi about another."""
     sine = math.sqrt(max(0.0, 1.0 - cosine * cosine))
     cp, sp = sine * math.cos(phi), sine * math.sin(phi)
@@ -98,8 +108,8 @@ def transport(
     begin: int,
     end: int,
     histories: int,
-    key: Any,
-    labels: Any,
+    key: np.uint64,
+    labels: Ints,
     x0: float,
     y0: float,
     step: float,
@@ -108,20 +118,20 @@ def transport(
     score_z: float,
     sod: float,
     half_fan: float,
-    fan_cdf: Any,
-    energy_cdf: Any,
-    energies: Any,
+    fan_cdf: Floats,
+    energy_cdf: Floats,
+    energies: Floats,
     table_low: float,
     table_step: float,
-    attenuation: Any,
-    photo: Any,
-    compton: Any,
-    absorption: Any,
-    largest: Any,
-    squares: Any,
-    form: Any,
+    attenuation: Floats,
+    photo: Floats,
+    compton: Floats,
+    absorption: Floats,
+    largest: Floats,
+    squares: Floats,
+    form: Floats,
     cutoff: float,
-    tally: Any,
+    tally: Floats,
 ) -> None:
     """Energy deposited per map pixel by unscattered (tally[:, 0]) and scattered (tally[:, 1])
     photons, keV.

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Floats, Ints, Reals
+
 
 __all__ = ["evaluate"]
 
@@ -14,12 +18,12 @@ __all__ = ["evaluate"]
 def evaluate(
     begin: int,
     end: int,
-    p: Any,
-    first_column: Any,
-    coefficients: Any,
-    scale: Any,
+    p: Reals,
+    first_column: Ints,
+    coefficients: Floats,
+    scale: Floats,
     slope: bool,
-    out: Any,
+    out: Reals,
 ) -> None:
     """Corrected line integrals (or the slope of the correction) of ``(lines, columns)`` readings.
 

@@ -14,7 +14,6 @@ v² - 1``.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numba
 import numpy as np
@@ -44,7 +43,7 @@ _PIECES = 64
 
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
-def unit_circle(lx: float, ly: float, ux: float, uy: float) -> Any:
+def unit_circle(lx: float, ly: float, ux: float, uy: float) -> tuple[float, float]:
     """Interval of a line inside the unit circle (its height does not matter); ``t1 <= t0`` for a
     miss."""
     a = ux * ux + uy * uy
@@ -64,7 +63,7 @@ def unit_circle(lx: float, ly: float, ux: float, uy: float) -> Any:
 
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
-def clip(t0: float, t1: float, lz: float, uz: float, half_length: float) -> Any:
+def clip(t0: float, t1: float, lz: float, uz: float, half_length: float) -> tuple[float, float]:
     """The part of ``(t0, t1)`` with ``|lz + t uz| <= half_length``."""
     if half_length == math.inf:
         return t0, t1
@@ -228,7 +227,7 @@ def shallow(
     amplitude: float,
     omega: float,
     reach: float,
-) -> Any:
+) -> tuple[float, float]:
     """Interval of a ray of small slope inside the endless tube; ``t1 <= t0`` for a miss."""
     flat = ux * ux + uy * uy
     if flat == 0.0:  # only for a tube without a bulge, whose slope is not limited
@@ -401,7 +400,7 @@ def steep(
     omega: float,
     reach: float,
     half_length: float,
-) -> Any:
+) -> tuple[float, float]:
     """First entry of any ray into the tube and, added to it, the total length inside."""
     total, first = 0.0, math.inf
     bulge0, bulge1 = (-reach - lz) / uz, (reach - lz) / uz
@@ -461,7 +460,9 @@ def steep(
 
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
-def _ellipsoid(lx: float, ly: float, lz: float, ux: float, uy: float, uz: float) -> Any:
+def _ellipsoid(
+    lx: float, ly: float, lz: float, ux: float, uy: float, uz: float
+) -> tuple[float, float]:
     a = ux * ux + uy * uy + uz * uz
     # Measured from the point of closest approach: no difference of large numbers for a far source.
     inverse = 1.0 / a
@@ -475,7 +476,7 @@ def _ellipsoid(lx: float, ly: float, lz: float, ux: float, uy: float, uz: float)
 
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
-def _box(lx: float, ly: float, lz: float, ux: float, uy: float, uz: float) -> Any:
+def _box(lx: float, ly: float, lz: float, ux: float, uy: float, uz: float) -> tuple[float, float]:
     t0, t1 = -math.inf, math.inf
     for axis in range(3):
         p = lx if axis == 0 else (ly if axis == 1 else lz)
@@ -503,7 +504,7 @@ def interval(
     dx: float,
     dy: float,
     dz: float,
-) -> Any:
+) -> tuple[float, float]:
     """Where the straight line ``o + t d`` is inside one packed shape.
 
     Args:
@@ -550,7 +551,13 @@ def interval(
 
 @numba.njit(nogil=True, cache=True, fastmath=_FAST, error_model="numpy")
 def chords(
-    begin: int, end: int, kinds: Any, params: Any, origins: Any, directions: Any, out: Any
+    begin: int,
+    end: int,
+    kinds: NDArray[np.int64],
+    params: NDArray[np.float64],
+    origins: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    out: NDArray[np.float64],
 ) -> None:
     """Chord of the lines ``begin … end`` in every shape, ``out (B, N)``."""
     for n in range(begin, end):
@@ -568,7 +575,9 @@ def chords(
 
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
-def may_meet(params: Any, b: int, ox: float, oy: float, dx: float, dy: float) -> bool:
+def may_meet(
+    params: NDArray[np.float64], b: int, ox: float, oy: float, dx: float, dy: float
+) -> bool:
     """Whether rays from a point whose unit direction in the plane is (dx, dy) may meet shape
     ``b``: they pass through its bounding cylinder, whatever their climb."""
     cross = (params[b, 0] - ox) * dy - (params[b, 1] - oy) * dx
@@ -578,17 +587,17 @@ def may_meet(params: Any, b: int, ox: float, oy: float, dx: float, dy: float) ->
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def chords_from(
     kind: int,
-    params: Any,
+    params: NDArray[np.float64],
     b: int,
     ox: float,
     oy: float,
     oz: float,
-    dx: Any,
-    dy: Any,
-    dz: Any,
-    stretch: Any,
+    dx: NDArray[np.float64],
+    dy: NDArray[np.float64],
+    dz: NDArray[np.float64],
+    stretch: NDArray[np.float64],
     count: int,
-    out: Any,
+    out: NDArray[np.float64],
 ) -> None:
     """Chords of ``count`` rays from one point in one packed shape.
 
@@ -617,17 +626,17 @@ def chords_from(
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _ellipsoid_chords(
-    params: Any,
+    params: NDArray[np.float64],
     b: int,
     lx: float,
     ly: float,
     lz: float,
-    dx: Any,
-    dy: Any,
-    dz: Any,
-    stretch: Any,
+    dx: NDArray[np.float64],
+    dy: NDArray[np.float64],
+    dz: NDArray[np.float64],
+    stretch: NDArray[np.float64],
     count: int,
-    out: Any,
+    out: NDArray[np.float64],
 ) -> None:
     xx, xy, xz = params[b, 9], params[b, 10], params[b, 11]
     yx, yy, yz = params[b, 12], params[b, 13], params[b, 14]
@@ -657,17 +666,17 @@ def _clipped(t0: float, t1: float, lz: float, uz: float, half_length: float) -> 
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _cylinder_chords(
-    params: Any,
+    params: NDArray[np.float64],
     b: int,
     lx: float,
     ly: float,
     lz: float,
-    dx: Any,
-    dy: Any,
-    dz: Any,
-    stretch: Any,
+    dx: NDArray[np.float64],
+    dy: NDArray[np.float64],
+    dz: NDArray[np.float64],
+    stretch: NDArray[np.float64],
     count: int,
-    out: Any,
+    out: NDArray[np.float64],
 ) -> None:
     half_length = params[b, 18]
     endless = half_length == math.inf
@@ -705,17 +714,17 @@ def _slab(p: float, u: float) -> tuple[float, float]:
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _box_chords(
-    params: Any,
+    params: NDArray[np.float64],
     b: int,
     lx: float,
     ly: float,
     lz: float,
-    dx: Any,
-    dy: Any,
-    dz: Any,
-    stretch: Any,
+    dx: NDArray[np.float64],
+    dy: NDArray[np.float64],
+    dz: NDArray[np.float64],
+    stretch: NDArray[np.float64],
     count: int,
-    out: Any,
+    out: NDArray[np.float64],
 ) -> None:
     xx, xy, xz = params[b, 9], params[b, 10], params[b, 11]
     yx, yy, yz = params[b, 12], params[b, 13], params[b, 14]
@@ -733,17 +742,17 @@ def _box_chords(
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _tube_chords(
     narrowed: bool,
-    params: Any,
+    params: NDArray[np.float64],
     b: int,
     lx: float,
     ly: float,
     lz: float,
-    dx: Any,
-    dy: Any,
-    dz: Any,
-    stretch: Any,
+    dx: NDArray[np.float64],
+    dy: NDArray[np.float64],
+    dz: NDArray[np.float64],
+    stretch: NDArray[np.float64],
     count: int,
-    out: Any,
+    out: NDArray[np.float64],
 ) -> None:
     """As :func:`shallow`, two steps of Newton's method for every ray; what they do not settle is
     left to :func:`shallow` and :func:`steep`."""

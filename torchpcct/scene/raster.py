@@ -45,14 +45,14 @@ _POINTS = 1 << 19
 def _fill(
     begin: int,
     end: int,
-    kinds: Any,
-    params: Any,
-    zs: Any,
-    ys: Any,
+    kinds: NDArray[np.int64],
+    params: Floats,
+    zs: Floats,
+    ys: Floats,
     x_edge: float,
     dx: float,
     lines: int,
-    out: Any,
+    out: Floats,
 ) -> None:
     bodies, _, ny, nx = out.shape
     share = 1.0 / lines

@@ -12,10 +12,16 @@ information.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from torchpcct.typing import Floats, Ints, Reals
+
 
 __all__ = ["expected", "solve"]
 
@@ -39,7 +45,7 @@ _SUM = {"reassoc", "contract", "nsz"}
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _transmissions(a1: float, a2: float, mu: Any, v: Any) -> None:
+def _transmissions(a1: float, a2: float, mu: Floats, v: Floats) -> None:
     for e in range(mu.shape[1]):
         mu1, mu2 = mu[0, e], mu[1, e]
         x = min(max(-(a1 * mu1 + a2 * mu2), _LOWEST), _HIGHEST)
@@ -63,7 +69,7 @@ def _transmissions(a1: float, a2: float, mu: Any, v: Any) -> None:
 
 
 @njit(cache=True, error_model="numpy", fastmath=_SUM)
-def _moments(spectra: Any, v: Any, scale: float, m: Any) -> None:
+def _moments(spectra: Floats, v: Floats, scale: float, m: Floats) -> None:
     for b in range(spectra.shape[0]):
         s0 = s1 = s2 = s3 = s4 = s5 = 0.0
         for e in range(spectra.shape[1]):
@@ -83,7 +89,7 @@ def _moments(spectra: Any, v: Any, scale: float, m: Any) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _information(m: Any) -> Any:
+def _information(m: Floats) -> tuple[float, float, float]:
     f11 = f12 = f22 = 0.0
     for b in range(m.shape[0]):
         inverse = 1.0 / m[b, 0]
@@ -94,7 +100,9 @@ def _information(m: Any) -> Any:
 
 
 @njit(cache=True, error_model="numpy")
-def _newton(n: Any, m: Any, reduce_bias: bool) -> Any:
+def _newton(
+    n: Floats, m: Floats, reduce_bias: bool
+) -> tuple[float, float, float, float, float, float, float, float, float]:
     """Score, Fisher information and the (observed, if positive definite) information that scales
     the step."""
     f11, f12, f22 = _information(m)
@@ -124,7 +132,7 @@ def _newton(n: Any, m: Any, reduce_bias: bool) -> Any:
 @njit(cache=True, error_model="numpy")
 def _direction(
     u1: float, u2: float, j11: float, j12: float, j22: float, held1: bool, held2: bool
-) -> Any:
+) -> tuple[float, float]:
     if held1 and held2:
         return 0.0, 0.0
     if held1:
@@ -137,20 +145,20 @@ def _direction(
 
 @njit(cache=True, error_model="numpy")
 def _iterate(
-    n: Any,
+    n: Floats,
     scale: float,
-    mu: Any,
-    spectra: Any,
-    v: Any,
-    m: Any,
+    mu: Floats,
+    spectra: Floats,
+    v: Floats,
+    m: Floats,
     a1: float,
     a2: float,
-    bounds: Any,
-    reach: Any,
+    bounds: Floats,
+    reach: Floats,
     reduce_bias: bool,
     tolerance: float,
     limit: int,
-) -> Any:
+) -> tuple[float, float, float, float, float, int]:
     """Damped Newton steps from (a1, a2) inside the box ``bounds``; ends after a step shorter
     than ``tolerance`` SDs."""
     f11 = f12 = f22 = 0.0
@@ -194,26 +202,26 @@ def _iterate(
 def solve(
     begin: int,
     end: int,
-    counts: Any,
-    column: Any,
-    scale: Any,
-    mu: Any,
-    spectra: Any,
-    coarse_mu: Any,
-    coarse_spectra: Any,
-    air: Any,
-    start_step: Any,
-    start: Any,
-    direction: Any,
-    bounds: Any,
-    reach: Any,
+    counts: Reals,
+    column: Ints,
+    scale: Floats,
+    mu: Floats,
+    spectra: Floats,
+    coarse_mu: Floats,
+    coarse_spectra: Floats,
+    air: Floats,
+    start_step: Floats,
+    start: Floats,
+    direction: Floats,
+    bounds: Floats,
+    reach: Floats,
     reduce_bias: bool,
     coarse_tolerance: float,
     tolerance: float,
     limit: int,
-    out: Any,
-    information: Any,
-    steps: Any,
+    out: Reals,
+    information: Reals,
+    steps: NDArray[np.int32],
 ) -> None:
     """Estimates for ``counts`` (bins, rays); see :func:`torchpcct.spectral.decompose.decompose`.
 
@@ -272,13 +280,13 @@ def solve(
 def expected(
     begin: int,
     end: int,
-    line_integrals: Any,
-    column: Any,
-    scale: Any,
-    mu: Any,
-    spectra: Any,
-    counts: Any,
-    slopes: Any,
+    line_integrals: Floats,
+    column: Ints,
+    scale: Floats,
+    mu: Floats,
+    spectra: Floats,
+    counts: Reals,
+    slopes: Floats,
 ) -> None:
     """λ into ``counts`` (bins, rays); λ₁, λ₂, λ₁₁, λ₁₂, λ₂₂ into ``slopes`` (5, bins, rays)."""
     bins = counts.shape[0]

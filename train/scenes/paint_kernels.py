@@ -14,12 +14,16 @@ the plane normal to the curve there.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
 
 from train.scenes.scene import Tissue
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
 
 __all__ = ["HALO", "INNER", "LUMEN", "OUTER", "QUADRIC", "QUADRIC_IN_TUBE", "STENT", "paint"]
 
@@ -52,7 +56,7 @@ def _cut(d: float, nx: float, ny: float, nz: float, cell: float) -> float:
 
 
 @numba.njit(cache=True, fastmath=True)
-def _ellipse(u: float, w: float, a: float, b: float, cell: float) -> Any:
+def _ellipse(u: float, w: float, a: float, b: float, cell: float) -> tuple[float, float, float]:
     """Distance to the ellipse of semi-axes a, b, and the unit gradient: its function over the
     gradient's length, plus the curvature's term."""
     p, q = u / a, w / b
@@ -66,7 +70,9 @@ def _ellipse(u: float, w: float, a: float, b: float, cell: float) -> Any:
 
 
 @numba.njit(cache=True, fastmath=True)
-def _quadric(x: float, y: float, z: float, row: Any, cell: float) -> Any:
+def _quadric(
+    x: float, y: float, z: float, row: NDArray[np.float64], cell: float
+) -> tuple[float, float, float, float]:
     """Distance averaged over a cube of side ``cell`` about a point relative to the superquadric's
     centre, and the unit gradient."""
     x0 = row[3] * x + row[4] * y + row[5] * z
@@ -104,7 +110,14 @@ def _quadric(x: float, y: float, z: float, row: Any, cell: float) -> Any:
 
 @numba.njit(cache=True, fastmath=True)
 def _foot(
-    x: float, y: float, z: float, t: Any, tube: Any, reach: float, cell: float, out: Any
+    x: float,
+    y: float,
+    z: float,
+    t: NDArray[np.float64],
+    tube: NDArray[np.float64],
+    reach: float,
+    cell: float,
+    out: NDArray[np.float64],
 ) -> float:
     """Of a point in a tube's frame; returns by how far it lies beyond ``reach``, then with
     ``out[0]`` FAR.
@@ -178,7 +191,7 @@ def _foot(
 
 
 @numba.njit(cache=True, fastmath=True)
-def _wire(local: Any, row: Any) -> float:
+def _wire(local: NDArray[np.float64], row: NDArray[np.float64]) -> float:
     """Distance to the wires of a stent.
 
     ``row``: inset, half width, pitch, waves, amplitude, first, last.
@@ -201,14 +214,14 @@ def _wire(local: Any, row: Any) -> float:
 
 @numba.njit(cache=True, fastmath=True, nogil=True)
 def _fill(
-    out: Any,
+    out: NDArray[np.float32],
     cell: float,
-    tables: Any,
-    tubes: Any,
-    reaches: Any,
-    bodies: Any,
-    values: Any,
-    rows: Any,
+    tables: NDArray[np.float64],
+    tubes: NDArray[np.float64],
+    reaches: NDArray[np.float64],
+    bodies: NDArray[np.int64],
+    values: NDArray[np.float64],
+    rows: NDArray[np.float64],
     background: float,
     signal: int,
     around: int,
@@ -315,7 +328,7 @@ def _fill(
 
 def paint(
     shape: tuple[int, int, int], cell: float, arrays: tuple[Any, ...], signal: int, around: int
-) -> Any:
+) -> NDArray[np.float32]:
     """Averages over cubic cells of a grid about the origin, ``(5, nz, ny, nx)`` float32.
 
     Image in HU; fractions of the tissue ``signal``, of the tissue ``around``, of background and
