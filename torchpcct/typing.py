@@ -21,4 +21,4 @@ Ints: TypeAlias = NDArray[np.int64]
 Reals: TypeAlias = NDArray[np.float32 | np.float64]
 """Readings, images and volumes: computed in the precision in which they come."""
 
-Json: TypeAlias = "None | bool | int | float | str | list[Json] | dict[str, Json]"
+Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
