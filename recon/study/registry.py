@@ -48,6 +48,9 @@ STUDIES: dict[str, str] = {
         "scans with too few photons, faults, missing data or a wrong description: which "
         "results are wrong"
     ),
+    "recovery": (
+        "what each method shows of small and faint bodies that are inserted into the paper's scan"
+    ),
     "spectral": (
         "energy bins into PE and PVC: monochromatic images, best energy, tissue maps, by "
         "FBP and joint MBIR"

@@ -65,6 +65,15 @@ TINY: dict[str, dict[str, Any]] = {
         "experiments": 500,
     },
     "resolution": {"thinning": 32, "sigmas_px": (0.0, 3.75, 10.0)},
+    "recovery": {
+        "methods": ("fbp:standard", "pwls"),
+        "balls": ((1.0, 200.0),),
+        "exposures_s": (2.0,),
+        "n": 2,
+        "places": 2,
+        "views": 48,
+        "voxel_mm": 0.4,
+    },
     "spectral": {
         "views": 60,
         "voxel_mm": 0.4,

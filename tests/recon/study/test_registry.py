@@ -80,6 +80,7 @@ COUNTS = {
     "motion": "thinning",
     "noise": "views",
     "phantom": "sections",
+    "recovery": "places",
     "resolution": "thinning",
     "spectral": "views",
 }
@@ -156,6 +157,13 @@ BAD = {
         ({"kernels": ("soft",), "voxels_mm": (0.2,)}, "two settings"),
         ({"experiments": 1}, "experiments"),
         ({"reconstructed": 0}, "reconstructed"),
+    ],
+    "recovery": [
+        ({"balls": ()}, "at least one each"),
+        ({"balls": ((1.0, 0.0),)}, "contrast_hu"),
+        ({"voxel_mm": 0.0}, "voxel_mm"),
+        ({"exposures_s": (0.0,)}, "exposures_s"),
+        ({"methods": ("fbp:sofd",)}, "sofd"),
     ],
     "resolution": [
         ({"sigmas_px": (1.0, 2.0, 3.0)}, "rise from 0"),

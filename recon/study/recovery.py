@@ -1,0 +1,208 @@
+"""What each method shows of small and faint bodies in the paper's scan, by dose: contrast recovery
+by insertion (:mod:`recon.evaluate.insertion`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from recon.evaluate.insertion import REFERENCE, ContrastRecovery, InsertedBall, contrast_recovery
+from recon.evaluate.names import check_method
+from recon.jobs.store import Pieces
+from recon.study.paper import facts as paper
+from recon.study.paper.plaque_scan import duty, inset_grid
+from recon.study.study import Measured, Progress, StudySettings, silent
+from torchpcct.acquisition.acquire import acquire
+from torchpcct.scan import Scan
+from torchpcct.scanner import presets
+from torchpcct.scene.plaque import plaque_scene
+from torchpcct.validate import number, numbers
+
+__all__ = ["Settings", "figures", "measure"]
+
+
+@dataclass(frozen=True)
+class Settings(StudySettings):
+    """Settings of the study.
+
+    Args:
+        methods: what is measured, see :mod:`recon.evaluate.methods`.
+        balls: diameters in mm and contrasts in HU.
+        exposures_s: of the scans in s.
+        n: noise realisations.
+        places: balls in each, at other places in each realisation.
+        seed: of the first realisation.
+        views: per rotation.
+        voxel_mm: of the volumes.
+    """
+
+    methods: tuple[str, ...] = (
+        "fbp:standard",
+        "pwls",
+        "bilateral@fbp:detail",
+        "mbir:prior=bilateral",
+        "mbir",
+        "mbir:fidelity=1",
+    )
+    balls: tuple[tuple[float, float], ...] = (
+        (0.5, 600.0),
+        (0.5, 300.0),
+        (1.0, 400.0),
+        (1.0, 100.0),
+        (1.0, -100.0),
+        (1.5, 50.0),
+    )
+    exposures_s: tuple[float, ...] = (paper.DOSES["1x"], paper.DOSES["5.7x"])
+    n: int = 2
+    places: int = 8
+    seed: int = 0
+    views: int = paper.FULL_VIEWS["PCCT"]
+    voxel_mm: float = 0.2
+
+    # An eighth of the views, one realisation, one ball.
+    QUICK: ClassVar[Mapping[str, Any]] = {
+        "views": 246,
+        "n": 1,
+        "balls": ((1.0, 100.0),),
+        "methods": ("pwls", "mbir"),
+    }
+
+    def __post_init__(self) -> None:
+        self.check_whole(n=1, places=2, seed=0, views=8)
+        numbers("exposures_s", self.exposures_s, positive=True, unit="s")
+        number("voxel_mm", self.voxel_mm, positive=True, high=0.5, unit="mm")
+        if not self.methods or not self.balls:
+            raise ValueError("methods and balls must name at least one each")
+        for method in self.methods:
+            check_method(method)
+        for ball in self.balls:
+            InsertedBall(*ball)
+
+
+def measure(
+    settings: Settings, progress: Progress = silent, folder: str | Path | None = None
+) -> Measured:
+    """Insert, reconstruct, compare; see :mod:`recon.study.study`.
+
+    ``rows`` of the data, one for each exposure, ball and method: ``exposure_s``, ``diameter_mm``,
+    ``contrast_hu``, ``method``, ``recovered`` with its ``standard_error`` (over places and
+    realisations), ``soft_fbp``, ``verdict`` (``less``, ``more`` or ``as much`` as soft FBP), and
+    how many ``balls`` there were.
+    """
+    s = settings
+    pieces = Pieces(folder, s)
+    jobs = [(e, seed) for e in s.exposures_s for seed in range(s.seed, s.seed + s.n)]
+    pieces.ahead(_realisation, *jobs)
+    clean = _clean(s, pieces)
+    found: dict[tuple[float, int], list[dict[str, Any]]] = {}
+    for k, job in enumerate(jobs):
+        progress("realisations", k / len(jobs))
+        found[job] = _realisation(s, pieces, *job, clean=clean)
+    progress("realisations", 1.0)
+    rows = []
+    for exposure in s.exposures_s:
+        of_draws = [found[exposure, seed] for seed in range(s.seed, s.seed + s.n)]
+        rows += [_pooled(exposure, same) for same in zip(*of_draws, strict=True)]
+    return Measured(s, {"rows": rows, "reference": REFERENCE})
+
+
+def _clean(settings: Settings, pieces: Pieces) -> Scan:
+    """The noise-free scan."""
+    scene, plaque = plaque_scene()
+    scanner = presets.pcct(views=settings.views)
+    grid = inset_grid(plaque, settings.voxel_mm)
+    on = duty(scanner, paper.FULL_VIEWS["PCCT"])
+    scan: Scan = pieces("scan", lambda: acquire(scene, scanner, region=grid, duty=on))
+    return scan
+
+
+def _realisation(
+    settings: Settings, pieces: Pieces, exposure_s: float, seed: int, clean: Scan | None = None
+) -> list[dict[str, Any]]:
+    """All balls and methods in one noise realisation."""
+    rows: list[dict[str, Any]] = pieces(
+        f"{exposure_s:g}_{seed}", partial(_rows, settings, pieces, exposure_s, seed, clean)
+    )
+    return rows
+
+
+def _rows(
+    s: Settings, pieces: Pieces, exposure_s: float, seed: int, clean: Scan | None
+) -> list[dict[str, Any]]:
+    scan = clean or _clean(s, pieces)
+    balls = [InsertedBall(*ball) for ball in s.balls]
+    found = contrast_recovery(
+        scan.with_noise(exposure_s, seed),
+        inset_grid(plaque_scene()[1], s.voxel_mm),
+        list(s.methods),
+        balls,
+        n=s.places,
+        seed=seed,
+    )
+    return [row.as_dict() for row in found]
+
+
+def _pooled(exposure_s: float, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """One ball and method over the realisations."""
+    first = rows[0]
+    together = ContrastRecovery(
+        first["method"],
+        InsertedBall(first["diameter_mm"], first["contrast_hu"]),
+        tuple(v for row in rows for v in row["values"]),
+        tuple(v for row in rows for v in row["reference"]),
+        tuple(tuple(p) for row in rows for p in row["places_mm"]),
+    )
+    kept = ("diameter_mm", "contrast_hu", "method", "recovered", "standard_error")
+    found = together.as_dict()
+    return {
+        "exposure_s": exposure_s,
+        **{key: found[key] for key in (*kept, "soft_fbp", "verdict")},
+        "balls": len(together.values),
+    }
+
+
+def figures(measured: Measured) -> dict[str, Any]:
+    """Contrast recovery by ball, a colour for each method, an exposure in each panel."""
+    from matplotlib.figure import Figure
+
+    s: Settings = measured.settings
+    rows = measured.data["rows"]
+    figure = Figure((5.4 * len(s.exposures_s), 4.2), dpi=110, layout="constrained")
+    panels: Any = figure.subplots(1, len(s.exposures_s), sharey=True, squeeze=False)[0]
+    width = 0.8 / len(s.methods)
+    for axes, exposure in zip(panels, s.exposures_s, strict=True):
+        at = np.arange(len(s.balls))
+        for k, method in enumerate(s.methods):
+            of = [r for r in rows if r["exposure_s"] == exposure and r["method"] == method]
+            axes.bar(
+                at - 0.4 + (k + 0.5) * width,
+                [r["recovered"] for r in of],
+                width,
+                yerr=[2.0 * (r["standard_error"] or 0.0) for r in of],
+                label=method,
+                error_kw={"linewidth": 1.0},
+            )
+        soft = [
+            next(
+                r["soft_fbp"]
+                for r in rows
+                if r["exposure_s"] == exposure and (r["diameter_mm"], r["contrast_hu"]) == tuple(b)
+            )
+            for b in s.balls
+        ]
+        for place, value in zip(at, soft, strict=True):
+            axes.plot([place - 0.45, place + 0.45], [value] * 2, color="black", linewidth=1.5)
+        axes.plot([], [], color="black", linewidth=1.5, label=REFERENCE)
+        axes.axhline(1.0, color="0.6", linewidth=0.8)
+        axes.set_xticks(at, [f"{d:g} mm\n{c:+g} HU" for d, c in s.balls], fontsize=8)
+        axes.set_title(f"{exposure:g} s", fontsize=10)
+        axes.grid(axis="y", color="0.9")
+        axes.set_axisbelow(True)
+    panels[0].set_ylabel("contrast shown / true contrast")
+    panels[-1].legend(fontsize=7, frameon=False, loc="upper right")
+    return {"recovery.png": figure}
