@@ -42,14 +42,6 @@ _SURROUND_TOLERANCE = 0.01
 _GAIN_TOLERANCE = 0.004
 """Relative deviation of the readings at a window's borders from its surround, and standard
 deviation of the gains of single cells, that are no finding."""
-_SHADOW = 0.1
-_ALIKE = 0.7
-_SOFT_MM = 0.1
-_BLACK = 5.0
-_OTHER_UNIT = (0.02, 0.25)
-"""Share of the highest line integral that is the object's shadow; of a row's that the next rows
-show, too; attenuation of water in mm⁻¹ of photons (18 keV) that pass no patient; line integral from
-which nothing passes; and share of it that a unit's factor of ten leaves."""
 _BORDER = 2
 """Columns at either border of a window that are compared with the surround."""
 _RIM = 0.05
@@ -213,10 +205,12 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
     Returns:
         Warnings; empty if nothing is found, or nothing can be compared.
     """
+    from recon.analytic.water_unit import unit_warnings  # reconstructs, which imports this module
     from torchpcct.checks.columns import column_test
     from torchpcct.checks.moments import moment_test
     from torchpcct.checks.neighbours import neighbour_test
     from torchpcct.checks.opposite_rays import geometry_test  # loads scipy.stats
+    from torchpcct.checks.readings import without_light
 
     whole, window, about = scan, scan.window, (0.0, 0.0)
     if window is not None:
@@ -258,8 +252,8 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
         found.append(_cut_text(lines, sides))
     elif len(found) == len(columns) + len(unmeasured) and not is_offset(geometry):
         found += moment_test(lines, geometry).findings
-    if scan.unit == "HU":
-        found += _water_texts(lines, geometry, scan.linearisation.mu_ref)
+    if scan.unit == "HU" and (scan.logged or not without_light(scan)):
+        found += unit_warnings(lines, geometry, scan.linearisation.mu_ref)
     return found
 
 
@@ -296,37 +290,6 @@ def _unmeasured_texts(lines: Any, geometry: Any, grid: VolumeGrid) -> list[str]:
         f"through the object, in {math.degrees(lacking[worst]):.2g}° of their directions: edges "
         "along them are smeared, and values beside them wrong by tens of HU; add views until they "
         "cover half a turn and the fan of the object"
-    ]
-
-
-def _water_texts(lines: Any, geometry: Any, mu_water: float) -> list[str]:
-    """Water that would be black as thick as the object is, which lets ten times less than its line
-    integrals through: ``mu_water`` is of another unit. Of other errors of ``mu_water`` no data can
-    tell."""
-    p = lines.reshape(geometry.views, -1, geometry.columns).double().numpy()
-    densest = p.max((0, 2))
-    # Of what is thinner than a row no thickness is known.
-    beside = np.minimum(densest[:-2], densest[2:]) if len(densest) > 2 else densest[:0]
-    alike = (
-        np.flatnonzero(beside > _ALIKE * densest[1:-1]) + 1
-        if len(densest) > 1
-        else np.zeros(1, np.int64)
-    )
-    if mu_water < _SOFT_MM or not alike.size:
-        return []
-    row = int(alike[np.argmax(densest[alike])])
-    at = np.abs(np.gradient(reach(geometry)))
-    seen = p[:, row] > _SHADOW * densest[row]
-    # No object is thinner along all rays than it is wide in its narrowest view.
-    across = float((seen * at).sum(1).min())
-    black, found = mu_water * across, float(np.quantile(p[:, row].max(1), 0.9))
-    if black < _BLACK or not _OTHER_UNIT[0] * black < found < _OTHER_UNIT[1] * black:
-        return []
-    return [
-        f"water of mu_water = {mu_water:.3g} mm⁻¹ as thick as the object ({across:.3g} mm) would "
-        f"have a line integral of {black:.2g}, the densest here is {found:.2g}: all reads about "
-        f"{1000 * (found / black - 1):.0f} HU; is mu_water given in cm⁻¹? {mu_water:.3g} cm⁻¹ are "
-        f"{mu_water / 10:.3g} mm⁻¹"
     ]
 
 

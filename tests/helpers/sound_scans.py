@@ -25,6 +25,8 @@ BALL = 0
 CYLINDER = 1
 BOX = 2
 KINDS = ("parallel", "fan", "cone")
+DENSITIES = ((0.02, 0.05), (0.3, 0.6), (2.0, 7.5))
+"""Attenuation over that of water of foam, of wood, and of stone and metal."""
 
 
 @dataclass(frozen=True)
@@ -583,6 +585,16 @@ def draw(seed: int, *, kind: str | None = None, readings: int = 600_000) -> Draw
     if densest > 0:
         solids = [replace(s, value=s.value * wanted / densest) for s in solids]
         water *= wanted / densest
+    # Foam, wood, or stone and metal, by their attenuation over that of water. What is as light as a
+    # tenth of it, or as heavy as ten times, is also water in another unit.
+    rng_of_density = np.random.default_rng([seed, 3])
+    if rng_of_density.random() < 0.25:
+        low, high = DENSITIES[int(rng_of_density.integers(len(DENSITIES)))]
+        density = rng_of_density.uniform(low, high)
+        name += f" of {density:.2g} times water"
+        water /= density
+        if density > 1.0:
+            rightly.append("more than any tissue")
     # Thin bodies take many rays: those that miss them between two others would be another object's.
     thin = min((s.radii[2] for s in solids if s.value), default=math.inf)
     # Where a flat ball ends, the chords of two rays of a row begin so many columns apart.

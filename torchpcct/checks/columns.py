@@ -122,14 +122,18 @@ def _gain(blocks: Floats, g: Any) -> tuple[float, str]:
         wrong = (
             np.abs(size) > np.maximum(tolerance, _SIGMAS * np.maximum(error, usual))
         ) & constant
-        # Far from the axis nothing alike may stand about the mirrored place: interpolation blurs
-        # thin walls.
-        sides = [
-            np.sign(mean) * mean[..., np.clip(low + k, 0, bend.shape[-1] - 1)]
-            for k in (-1, 0, 1, 2)
-        ]
-        alike = np.where(
-            np.abs(centre) < 3.0 * width * step, 1.5 * np.abs(opposite), 3.0 * np.max(sides, axis=0)
+        # Nothing alike may stand about the mirrored place: interpolation blurs thin walls, and the
+        # faces of a round body that end within a row. Near the axis the column itself is there.
+        index = np.arange(bend.shape[-1])
+        sides = []
+        for k in (-1, 0, 1, 2):
+            there = np.clip(low + k, 0, bend.shape[-1] - 1)
+            apart = np.abs(there - index) >= 2 * width
+            like = np.maximum(2.0 * np.sign(mean) * mean[..., there], np.abs(mean[..., there]))
+            sides.append(np.where(apart, like, 0.0))
+        alike = 1.5 * np.maximum(
+            np.where(np.abs(centre) < 3.0 * width * step, np.abs(opposite), 0.0),
+            np.max(sides, axis=0),
         )
         wrong &= np.abs(mean) > np.where(inside, alike, 0.0)
         # The neighbours of a wrong gain bend by half as much, the other way.
@@ -143,9 +147,10 @@ def _gain(blocks: Floats, g: Any) -> tuple[float, str]:
         most = float(found.max())
         if most <= 1.1 * abs(largest):
             continue
-        row, k = np.unravel_index(int(np.argmax(found)), found.shape)
-        largest = float(math.expm1(-mean[row, k]))
-        text = _gain_text(wrong, int(row), int(k) + width, width, largest, float(error[row, k]), g)
+        row, column = np.unravel_index(int(np.argmax(found)), found.shape)
+        largest = float(math.expm1(-mean[row, column]))
+        deviation = float(error[row, column])
+        text = _gain_text(wrong, int(row), int(column) + width, width, largest, deviation, g)
     return largest, text
 
 

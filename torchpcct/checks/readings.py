@@ -20,7 +20,7 @@ from torch import Tensor
 from torchpcct.readings import DIM, FEWEST, MEDIAN_TO_SD, smoothed
 from torchpcct.scan import Scan
 
-__all__ = ["reading_warnings"]
+__all__ = ["reading_warnings", "without_light"]
 
 AIR_TOLERANCE = 0.015
 """Line integral of air below which the beam, or its calibration, is not that of the scan; 0.5 HU
@@ -50,7 +50,7 @@ def reading_warnings(scan: Scan) -> list[str]:
     g = scan.geometry
     if scan.noise_free or scan.counts.ndim > len(g.shape) + (not g.has_rows):
         return []
-    dim = [] if scan.logged else _without_light(scan)
+    dim = [] if scan.logged else without_light(scan)
     if scan.window is not None or g.columns < _LEAST_COLUMNS or g.views < _LEAST_VIEWS:
         return dim
     stack = g.has_rows or scan.counts.ndim == 2
@@ -75,7 +75,15 @@ def reading_warnings(scan: Scan) -> list[str]:
     return dim + (_clipped(counts, quantum) or offset or _brighter_than_air(lines))
 
 
-def _without_light(scan: Scan) -> list[str]:
+def without_light(scan: Scan) -> list[str]:
+    """Whether too many rays are too dark for their line integrals to be known.
+
+    Args:
+        scan: of counts, without energy bins.
+
+    Returns:
+        One sentence, or none.
+    """
     quanta = scan.counts if scan.quantum is None else scan.counts / scan.quantum
     if float(quanta.amin()) >= FEWEST:
         return []

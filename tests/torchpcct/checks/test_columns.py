@@ -85,3 +85,24 @@ def test_wrong_input_is_refused():
         column_test(torch.full(g.shape, math.nan), g)
     few = g.select(slice(10))
     assert column_test(torch.zeros(few.shape), few).sizes == {}
+
+
+@pytest.mark.parametrize(
+    ("offset", "radii", "mu"),
+    [
+        (-2.19, (3.91, 5.97), 0.06),
+        (2.25, (2.26, 5.64, 6.66), 0.093),
+        (3.85, (2.17, 2.41, 4.84), 0.09),
+        (-1.14, (1.87, 5.11), 0.079),
+        (-1.34, (2.25, 5.82), 0.095),
+    ],
+)
+def test_a_turned_part_that_ends_in_steps_within_a_row_has_no_wrong_gain(offset, radii, mu):
+    """The mirror image of a step that one column sees falls between others."""
+    g = ParallelBeam(full_turn(64), 60, 1.0, offset)
+    within = (np.arange(9) - 4.0) / 9.0
+    t = np.asarray(g.column_positions)[:, None] + within
+    chords = [2.0 * np.sqrt(np.clip(r * r - t * t, 0.0, None)) for r in radii]
+    light = np.mean([np.exp(-mu * chord) for chord in chords], axis=0).mean(-1)
+    n = np.random.default_rng(0).poisson(4e5 * light, (64, 60))
+    assert column_test(torch.from_numpy(-np.log(n / 4e5)), g).findings == ()
