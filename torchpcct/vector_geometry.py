@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, beam
 from torchpcct.validate import checked, number, whole
 
-__all__ = ["VectorGeometry", "check_motion", "helical_motion"]
+__all__ = ["VectorGeometry", "check_motion", "helical_motion", "split_motion"]
 
 Floats = NDArray[np.float64]
 
@@ -331,10 +331,18 @@ class VectorGeometry(Geometry):
             ValueError: a motion of the wrong shape.
         """
         axes = 2 if self.rows is None else 3
+        shift, turn = split_motion(motion, self.views, axes)
         back = np.zeros((self.views, 3))
-        back[:, :axes] = check_motion(motion, self.views, axes)[:, ::-1]
-        poses = self.poses
-        return self._with(1, poses[:, 1] - back, 0, None if self.parallel else poses[:, 0] - back)
+        back[:, :axes] = shift[:, ::-1]
+        poses = self.poses.copy()
+        poses[:, 1] -= back
+        if not self.parallel:
+            poses[:, 0] -= back
+        if turn is not None:
+            c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
+            x, y = poses[..., 0].copy(), poses[..., 1].copy()
+            poses[..., 0], poses[..., 1] = c * x + s * y, c * y - s * x
+        return self._with(0, poses[:, 0], 1, poses[:, 1], 2, poses[:, 2], 3, poses[:, 3])
 
     def as_circular(self) -> tuple[Geometry, Floats | None] | None:
         """The circular scan, and the motion of the grid or None, that this scan is, to 1e-9; else
@@ -408,7 +416,7 @@ def check_motion(motion: Any, views: int, axes: int) -> Floats:
     Raises:
         ValueError: a wrong shape, values that are not finite.
     """
-    shift = np.array(motion, dtype=np.float64)
+    shift = _numbers(motion)
     if shift.shape != (views, axes):
         raise ValueError(
             f"motion needs the shape ({views}, {axes}): views and the grid's axes, got "
@@ -417,6 +425,28 @@ def check_motion(motion: Any, views: int, axes: int) -> Floats:
     if not np.isfinite(shift).all():
         raise ValueError("motion has values that are not finite")
     return shift
+
+
+def _numbers(motion: Any) -> Floats:
+    """A copy in float64, of a tensor, too."""
+    plain = motion.detach().cpu().numpy() if hasattr(motion, "detach") else motion
+    return np.array(plain, dtype=np.float64)
+
+
+@checked
+def split_motion(motion: Any, views: int, axes: int) -> tuple[Floats, Floats | None]:
+    """Displacements of the grid per view ``(views, axes)``, and rotations about z ``(views,)`` rad
+    where a last column more has them.
+
+    Raises:
+        ValueError: a wrong shape, values that are not finite.
+    """
+    given = _numbers(motion)
+    if given.shape != (views, axes + 1):
+        return check_motion(given, views, axes), None
+    if not np.isfinite(given).all():
+        raise ValueError("motion has values that are not finite")
+    return given[:, :axes], given[:, axes]
 
 
 @checked

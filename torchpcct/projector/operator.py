@@ -15,6 +15,8 @@ from torch import Tensor, nn
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector.engine import ENGINES, Engine
+from torchpcct.projector.posed import PosedEngine
+from torchpcct.projector.poses import ParametricGeometry, with_parameters
 from torchpcct.projector.tables import Tables, VectorTables
 from torchpcct.switches import undisturbed, unswitched
 from torchpcct.vector_geometry import VectorGeometry
@@ -33,7 +35,7 @@ class Operator(nn.Module):
     """Passes of an engine from ``domain_shape`` to ``range_shape``, and their matched adjoint
     ``T``."""
 
-    def __init__(self, engine: Engine, transposed: bool = False) -> None:
+    def __init__(self, engine: Engine | PosedEngine, transposed: bool = False) -> None:
         super().__init__()
         self._engine, self._transposed = engine, transposed
         # in a list: a submodule that holds its parent would recurse
@@ -223,7 +225,9 @@ def _back(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
 _traced.register_autograd(_back, setup_context=_note)
 
 
-def _apply(x: Tensor, engine: Engine, transposed: bool) -> Tensor:
+def _apply(x: Tensor, engine: Engine | PosedEngine, transposed: bool) -> Tensor:
+    if isinstance(engine, PosedEngine):
+        return engine.apply(x, transposed)
     if torch.compiler.is_compiling():
         return cast(Tensor, _traced(x, engine.handle, transposed))
     return apply_linear(
@@ -259,13 +263,17 @@ class Projector(Operator):
         geometry: ``ParallelBeam`` or ``FanBeam`` with a 2-D grid, ``ConeBeam`` with a 3-D grid; or
             a :class:`~torchpcct.vector_geometry.VectorGeometry`: what is a circular scan, at rest
             or moving (a helix), takes the passes of one, anything else general ones on the CPU,
-            several times slower.
+            several times slower. Of one with tensors
+            (:func:`~torchpcct.projector.poses.with_parameters`) readings have gradients by them.
         grid: the voxel grid.
         window: the part of the detector to compute (``torchpcct.detector_window.footprint``), or
             None for all of it.
         motion: displacement of the grid in every view, ``(views, 2)`` (y, x) or ``(views, 3)`` (z,
             y, x) mm, or None: a volume that moves rigidly with its object is projected and
-            reconstructed at rest.
+            reconstructed at rest. A last column more is a rotation about the z axis, rad, before
+            the displacement. Of a tensor that requires a gradient readings have one, by general
+            passes on the CPU; its values are read at every pass, so that an optimiser may change
+            them.
 
     Raises:
         TypeError: an argument of the wrong kind, an input that is not float32 or float64.
@@ -275,13 +283,13 @@ class Projector(Operator):
 
     def __init__(
         self,
-        geometry: Geometry,
+        geometry: Geometry | ParametricGeometry,
         grid: VolumeGrid,
         window: DetectorWindow | None = None,
         motion: Any = None,
     ) -> None:
-        super().__init__(Engine(_tables(geometry, grid, window, motion)))
-        self.geometry = geometry
+        super().__init__(_engine(geometry, grid, window, motion))
+        self.geometry = geometry.base if isinstance(geometry, ParametricGeometry) else geometry
         self.grid = grid
         self.window = window
 
@@ -309,6 +317,22 @@ class Projector(Operator):
         if not batch:
             return 0
         return arrays + self._engine.workspace(batch, item, torch.device(device).type)
+
+
+def _engine(geometry: Any, grid: Any, window: Any, motion: Any) -> Engine | PosedEngine:
+    if not _is_free(motion) and not isinstance(geometry, ParametricGeometry):
+        return Engine(_tables(geometry, grid, window, motion))
+    scan = geometry if isinstance(geometry, ParametricGeometry) else with_parameters(geometry)
+    if motion is not None and not isinstance(motion, Tensor):
+        motion = torch.as_tensor(np.array(motion, dtype=np.float64))
+    return PosedEngine(scan, grid, window, motion)
+
+
+def _is_free(motion: Any) -> bool:
+    """Whether somebody wants derivatives by a motion, backward or forward."""
+    if not isinstance(motion, Tensor):
+        return False
+    return motion.requires_grad or torch.autograd.forward_ad.unpack_dual(motion).tangent is not None
 
 
 def _tables(geometry: Any, grid: Any, window: Any, motion: Any) -> Tables | VectorTables:

@@ -4,6 +4,7 @@ layers."""
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -20,7 +21,7 @@ from torchpcct.projector.rays import (
     slab_lattice,
     split,
 )
-from torchpcct.vector_geometry import VectorGeometry, check_motion
+from torchpcct.vector_geometry import VectorGeometry, split_motion
 
 __all__ = ["Tables", "VectorTables", "layer_spacing"]
 
@@ -54,7 +55,14 @@ class Tables:
         )
         self.rays = rays_of(geometry, window)
         if motion is not None:
-            self.rays = self.rays.moved(check_motion(motion, geometry.views, grid.ndim))
+            shift, turn = split_motion(motion, geometry.views, grid.ndim)
+            if turn is not None:  # a grid that turns is seen from elsewhere, displaced the same way
+                c, s = np.cos(turn), np.sin(turn)
+                y, x = shift[:, -2].copy(), shift[:, -1].copy()
+                shift[:, -2], shift[:, -1] = c * y - s * x, c * x + s * y
+                seen = replace(geometry, angles=geometry.angles - turn)
+                self.rays = rays_of(seen, window)
+            self.rays = self.rays.moved(shift)
         if not self.rays.parallel:
             # in the plane, whatever the source's height
             check_source(self.rays.source[:, 1::-1], grid.slice)

@@ -25,7 +25,18 @@ from numba import njit
 from torchpcct.kernel_cache import forget_outdated
 from torchpcct.projector.cpu.cone_kernels import INNER
 
-__all__ = ["SLAB_BLOCK", "backproject_vectors", "project_vectors"]
+__all__ = [
+    "NEAREST",
+    "POINT",
+    "SLAB_BLOCK",
+    "backproject_vectors",
+    "cell_parts",
+    "main_axis",
+    "overlap",
+    "place_cell",
+    "project_vectors",
+    "start_ray",
+]
 
 SLAB_BLOCK = 16
 """Slabs of one task of the adjoint."""
@@ -38,22 +49,41 @@ _SLOPE = 0.2
 fraction of the geometric mean of the other two."""
 _SMALL = 0.1
 """Or below this fraction of a voxel's."""
-_POINT = 1e-9
+POINT = 1e-9
 """A rectangle narrower than this part of a voxel is a point."""
 _small = njit(**INNER)
 
 
 @_small
-def _start(pose, i, j, parallel, ray):
-    """Origin and direction of the ray of cell offsets (i, j) into ``ray[0]``, ``ray[1]``."""
+def place_cell(pose, bend, i, j, local):
+    """A view as its cell (i, j) sees it: source, the cell's centre, and the steps there, into
+    ``local (4, 3)``."""
+    turn = j * bend
+    ahead, along = 1.0, j  # of the way from the source to the centre, and of u
+    ahead_step, along_step = 0.0, 1.0
+    if bend != 0.0:
+        ahead, along = math.cos(turn), math.sin(turn) / bend
+        ahead_step, along_step = -bend * math.sin(turn), ahead
     for k in range(3):
-        cell = pose[1, k] + j * pose[2, k] + i * pose[3, k]
-        ray[0, k] = cell if parallel else pose[0, k]
-        ray[1, k] = pose[0, k] if parallel else cell - pose[0, k]
+        way = pose[1, k] - pose[0, k]
+        local[0, k] = pose[0, k]
+        local[1, k] = pose[1, k] + (ahead - 1.0) * way + along * pose[2, k] + i * pose[3, k]
+        local[2, k] = ahead_step * way + along_step * pose[2, k]
+        local[3, k] = pose[3, k]
 
 
 @_small
-def _main_axis(ray, spacing):
+def start_ray(local, di, dj, parallel, ray):
+    """Origin and direction of the ray of offsets (di, dj) from a cell into ``ray[0]``,
+    ``ray[1]``."""
+    for k in range(3):
+        cell = local[1, k] + dj * local[2, k] + di * local[3, k]
+        ray[0, k] = cell if parallel else local[0, k]
+        ray[1, k] = local[0, k] if parallel else cell - local[0, k]
+
+
+@_small
+def main_axis(ray, spacing):
     """The axis along which the ray crosses most voxels; a hair's breadth in favour of y, then x."""
     best, most = 1, abs(ray[1, 1]) / spacing[1]
     for k in (0, 2):
@@ -64,15 +94,15 @@ def _main_axis(ray, spacing):
 
 
 @_small
-def _overlap(low, high, k, width):
+def overlap(low, high, k, width):
     """Share of the interval that lies in voxel k."""
-    if width < _POINT:
+    if width < POINT:
         return 1.0
     return (min(high, k + 1.0) - max(low, float(k))) / width
 
 
 @_small
-def _parts(pose, ray, parallel, axis, lower, spacing, shape):
+def cell_parts(pose, ray, parallel, axis, lower, spacing, shape):
     """Parts along u and along v into which a cell is cut, so that rectangles along the axes
     stand for them."""
     a, b = (axis + 2) % 3, (axis + 1) % 3
@@ -132,15 +162,15 @@ def _cell(pose, ray, parallel, axis, lower, spacing, shape, strides, r0, r1, fla
             continue
         a0, a1 = int(max(la, 0.0)), min(math.ceil(ua), shape[a])
         b0, b1 = int(max(lb, 0.0)), min(math.ceil(ub), shape[b])
-        if ha < _POINT:
+        if ha < POINT:
             a1 = min(a0 + 1, shape[a])
-        if hb < _POINT:
+        if hb < POINT:
             b1 = min(b0 + 1, shape[b])
         base = r * strides[axis]
         for ka in range(a0, a1):
-            weight = path * _overlap(la, ua, ka, ha)
+            weight = path * overlap(la, ua, ka, ha)
             for kb in range(b0, b1):
-                w = weight * _overlap(lb, ub, kb, hb)
+                w = weight * overlap(lb, ub, kb, hb)
                 at = base + ka * strides[a] + kb * strides[b]
                 if gather:
                     total += w * flat[at]
@@ -152,8 +182,6 @@ def _cell(pose, ray, parallel, axis, lower, spacing, shape, strides, r0, r1, fla
 @_small
 def _whole_cell(
     pose,
-    i,
-    j,
     ray,
     part,
     parallel,
@@ -170,7 +198,7 @@ def _whole_cell(
 ):
     """:func:`_cell` of all parts of the cell whose ray is in ``ray``; ``ray`` and ``part (4,
     3)`` are overwritten."""
-    parts_u, parts_v = _parts(pose, ray, parallel, axis, lower, spacing, shape)
+    parts_u, parts_v = cell_parts(pose, ray, parallel, axis, lower, spacing, shape)
     if parts_u * parts_v == 1:
         return _cell(
             pose, ray, parallel, axis, lower, spacing, shape, strides, r0, r1, flat, value, gather
@@ -182,9 +210,7 @@ def _whole_cell(
     total = 0.0
     for p in range(parts_v):
         for q in range(parts_u):
-            at_i = i + (p + 0.5) / parts_v - 0.5
-            at_j = j + (q + 0.5) / parts_u - 0.5
-            _start(part, at_i * parts_v, at_j * parts_u, parallel, ray)
+            start_ray(pose, (p + 0.5) / parts_v - 0.5, (q + 0.5) / parts_u - 0.5, parallel, ray)
             total += share * _cell(
                 part,
                 ray,
@@ -204,18 +230,16 @@ def _whole_cell(
 
 
 @_small
-def _project_view(pose, parallel, lower, spacing, shape, strides, flat, data):
+def _project_view(pose, parallel, bend, middle, lower, spacing, shape, strides, flat, data):
     rows, columns = data.shape
-    ray, part = np.empty((2, 3)), np.empty((4, 3))
+    ray, local, part = np.empty((2, 3)), np.empty((4, 3)), np.empty((4, 3))
     for i in range(rows):
         for j in range(columns):
-            at_i, at_j = i - (rows - 1) / 2, j - (columns - 1) / 2
-            _start(pose, at_i, at_j, parallel, ray)
-            axis = _main_axis(ray, spacing)
+            place_cell(pose, bend, i - middle, j - (columns - 1) / 2, local)
+            start_ray(local, 0.0, 0.0, parallel, ray)
+            axis = main_axis(ray, spacing)
             data[i, j] = _whole_cell(
-                pose,
-                at_i,
-                at_j,
+                local,
                 ray,
                 part,
                 parallel,
@@ -233,35 +257,42 @@ def _project_view(pose, parallel, lower, spacing, shape, strides, flat, data):
 
 
 @njit(nogil=True, cache=True)
-def project_vectors(begin, end, poses, parallel, lower, spacing, shape, strides, flat, data):
+def project_vectors(
+    begin, end, poses, parallel, bend, middle, lower, spacing, shape, strides, flat, data
+):
     """Line integrals of one volume in the views ``begin … end``.
 
     Args:
         poses: ``(views, 4, 3)``, see :class:`torchpcct.vector_geometry.VectorGeometry`.
         parallel: whether ``poses[:, 0]`` are directions.
+        bend: angle between neighbouring columns of a detector on an arc about the source, in rad,
+            whose columns follow the arc through the centre and whose rows stand along v; 0: flat.
+        middle: row, fractional, that stands at the centre: (rows - 1) / 2 of a centred detector.
         lower, spacing, shape, strides: ``(3,)`` x, y, z: lower edge and voxel size in mm, voxels,
             step in ``flat``.
         flat: the volume, flat.
         data: ``(views, rows, columns)`` output, overwritten.
     """
     for n in range(begin, end):
-        _project_view(poses[n], parallel, lower, spacing, shape, strides, flat, data[n])
+        _project_view(
+            poses[n], parallel, bend, middle, lower, spacing, shape, strides, flat, data[n]
+        )
 
 
 @_small
-def _gather_slabs(poses, parallel, lower, spacing, shape, strides, data, axis, r0, r1, flat):
+def _gather_slabs(
+    poses, parallel, bend, middle, lower, spacing, shape, strides, data, axis, r0, r1, flat
+):
     views, rows, columns = data.shape
-    ray, part = np.empty((2, 3)), np.empty((4, 3))
+    ray, local, part = np.empty((2, 3)), np.empty((4, 3)), np.empty((4, 3))
     for n in range(views):
         for i in range(rows):
             for j in range(columns):
-                at_i, at_j = i - (rows - 1) / 2, j - (columns - 1) / 2
-                _start(poses[n], at_i, at_j, parallel, ray)
-                if _main_axis(ray, spacing) == axis:
+                place_cell(poses[n], bend, i - middle, j - (columns - 1) / 2, local)
+                start_ray(local, 0.0, 0.0, parallel, ray)
+                if main_axis(ray, spacing) == axis:
                     _whole_cell(
-                        poses[n],
-                        at_i,
-                        at_j,
+                        local,
                         ray,
                         part,
                         parallel,
@@ -280,7 +311,7 @@ def _gather_slabs(poses, parallel, lower, spacing, shape, strides, data, axis, r
 
 @njit(nogil=True, cache=True)
 def backproject_vectors(
-    begin, end, poses, parallel, lower, spacing, shape, strides, data, axis, flat
+    begin, end, poses, parallel, bend, middle, lower, spacing, shape, strides, data, axis, flat
 ):
     """Add the exact transpose of :func:`project_vectors` to ``flat``: rays along one axis, in
     blocks of its slabs."""
@@ -289,6 +320,8 @@ def backproject_vectors(
         _gather_slabs(
             poses,
             parallel,
+            bend,
+            middle,
             lower,
             spacing,
             shape,
