@@ -31,6 +31,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -535,6 +536,16 @@ def _largest(values: Floats, k: int) -> bool:
     return bool(values[k] >= values[max(k - 3, 0) : k + 4].max())
 
 
+_MANY_COPIES = 0.2
+"""Share of the views that repeat others if the object is symmetric and there is no noise."""
+_AIR = 0.02
+"""Share of readings with the largest value of all, or of line integrals the smallest: air without
+noise."""
+_ALIKE = 1e-4
+"""Of the range of the readings: differences below are those of a projector in float32, and less
+than the noise of 10⁷ photons."""
+
+
 @checked
 def stuck_views(readings: Tensor, geometry: Geometry) -> list[str]:
     """Name views at different angles that hold the same readings, to the last digit.
@@ -644,7 +655,18 @@ def _copies(n: NDArray[Any], told: NDArray[np.bool_], angles: Floats) -> list[in
         before = first.setdefault(hashlib.sha256(n[k].tobytes()).digest(), k)
         if before != k and abs(angles[k] - angles[before]) > 1e-9:
             found.append(k)
-    return found
+    return [] if _symmetric(n, found) else found
+
+
+def _symmetric(n: NDArray[Any], copies: Collection[int]) -> bool:
+    """Whether views repeat as those of a symmetric object without noise do (a phantom of voxels, a
+    quarter of a turn later, or mirrored): many of them, and air reads the same everywhere, as it
+    does not with noise."""
+    if len(copies) < _MANY_COPIES * len(n):
+        return False
+    low, high = float(np.nanmin(n)), float(np.nanmax(n))
+    alike = _ALIKE * (high - low)
+    return max(float((n < low + alike).mean()), float((n > high - alike).mean())) > _AIR
 
 
 def _columns_text(edges: NDArray[np.int64], stuck: NDArray[np.bool_]) -> str:

@@ -12,7 +12,7 @@ import torch
 from analytic import Ellipsoid, line_integrals
 from refusals import refused
 
-from torchpcct import ConeBeam, FanBeam, ParallelBeam, full_turn
+from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, VolumeGrid, full_turn
 from torchpcct.checks.moments import moment_test
 from torchpcct.checks.neighbours import neighbour_test, stuck_views
 
@@ -133,6 +133,29 @@ def test_readings_that_repeat_are_named(kind):
     assert stuck_views(_counts(p).clamp_max(0.8 * PHOTONS), g) == []
     few = np.random.default_rng(0).poisson(4.0 * np.exp(-p)).astype(np.float32)
     assert stuck_views(torch.from_numpy(few), g) == []
+
+
+@pytest.mark.parametrize("kind", GEOMETRIES)
+def test_a_half_that_was_copied_is_named(kind):
+    g, p = GEOMETRIES[kind], _sinogram(kind)
+    copied, middle = _counts(p), g.views // 2
+    copied[middle:] = copied[: g.views - middle]
+    assert f"{g.views - middle} views hold the same readings" in stuck_views(copied, g)[0]
+
+
+@pytest.mark.parametrize("radius", [10.0, 17.0, 21.3])
+@pytest.mark.parametrize("photons", [2e3, 2e4, 1e6])
+def test_a_symmetric_phantom_of_voxels_without_noise_repeats_and_is_sound(radius, photons):
+    grid = VolumeGrid((80, 80), 0.5)
+    y, x = np.meshgrid(*grid.axes, indexing="ij")
+    disc = torch.from_numpy(np.where(np.hypot(x, y) < radius, 0.02, 0.0)).float()
+    for g in (
+        ParallelBeam(np.arange(180) * np.pi / 180, 96, 0.5),
+        FanBeam(full_turn(180), 300.0, 600.0, 96, 1.0),
+    ):
+        lines = Projector(g, grid)(disc)
+        assert stuck_views(photons * torch.exp(-lines), g) == []
+        assert stuck_views(lines, g) == []
 
 
 @pytest.mark.parametrize("kind", GEOMETRIES)
