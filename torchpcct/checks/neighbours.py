@@ -31,7 +31,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -651,18 +650,19 @@ def _copies(n: NDArray[Any], told: NDArray[np.bool_], angles: Floats) -> list[in
     something."""
     first: dict[bytes, int] = {}
     found = []
-    for k in np.flatnonzero(told.mean((1, 2)) > 0.5).tolist():
+    whole = np.flatnonzero(told.mean((1, 2)) > 0.5).tolist()
+    for k in whole:
         before = first.setdefault(hashlib.sha256(n[k].tobytes()).digest(), k)
         if before != k and abs(angles[k] - angles[before]) > 1e-9:
             found.append(k)
-    return [] if _symmetric(n, found) else found
+    return [] if _symmetric(n, len(found) / max(len(whole), 1)) else found
 
 
-def _symmetric(n: NDArray[Any], copies: Collection[int]) -> bool:
+def _symmetric(n: NDArray[Any], copies: float) -> bool:
     """Whether views repeat as those of a symmetric object without noise do (a phantom of voxels, a
-    quarter of a turn later, or mirrored): many of them, and air reads the same everywhere, as it
-    does not with noise."""
-    if len(copies) < _MANY_COPIES * len(n):
+    quarter of a turn later, or mirrored): a large share of them, and air reads the same
+    everywhere, as it does not with noise."""
+    if copies < _MANY_COPIES:
         return False
     low, high = float(np.nanmin(n)), float(np.nanmax(n))
     alike = _ALIKE * (high - low)
