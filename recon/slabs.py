@@ -31,10 +31,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.analytic.angular_weights import angular_weights
-from recon.analytic.backproject import BackprojectionPlan
 from recon.analytic.coverage import check_rows, consistency_warnings, sampling_warnings, view_notes
-from recon.analytic.detector_edges import Rows, continued, ends_cut_off, mirrored, row_ends
-from recon.analytic.fbp import filter_sinogram, read_window
+from recon.analytic.detector_edges import ends_cut_off, row_ends
+from recon.analytic.fbp import FbpPlan
 from recon.api import reconstruct, require_light
 from recon.jobs import execute
 from recon.jobs.sources import source_digest
@@ -55,7 +54,7 @@ from torchpcct.checks.readings import reading_warnings
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.formats.scans import adapted, open_scan, own_options
 from torchpcct.formats.volume_slabs import CHUNK, SlabFile, check_slab_name
-from torchpcct.geometry import Beam, Geometry, VolumeGrid, beam
+from torchpcct.geometry import Geometry, VolumeGrid, beam
 from torchpcct.projector import Projector
 from torchpcct.readings import MOST_DEAD
 from torchpcct.scan import Scan
@@ -305,9 +304,9 @@ def _give_back() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-class _Fbp:
-    """The FBP of a volume, of which slabs are made: the steps of :func:`recon.analytic.fbp.fbp`,
-    with its results."""
+class _SlabFbp:
+    """The FBP of a volume, of which slabs are made: with the results of
+    :func:`recon.analytic.fbp.fbp`, and within its memory."""
 
     def __init__(
         self,
@@ -317,64 +316,52 @@ class _Fbp:
         sides: tuple[bool, bool],
         water: float,
     ) -> None:
-        self.geometry, self.grid, self.kernel, self.sides, self.water = (
-            geometry,
-            grid,
-            kernel,
-            sides,
-            water,
-        )
+        self.geometry, self.grid, self.water = geometry, grid, water
         self.cone = geometry.has_rows
-        self.plane = grid if self.cone else grid.slice
-        self.weights = angular_weights(geometry, self.plane)
-        self.wide: Any = self.complete(
-            torch.empty(geometry.shape, device="meta"), beam(geometry)
-        ).geometry
-        self.window = read_window(self.wide, self.plane)
-        self.plan = BackprojectionPlan(self.wide, self.plane, self.window)
-
-    def complete(self, lines: Tensor, geometry: Beam) -> Rows:
-        rows = Rows(lines, geometry, self.weights)
-        return mirrored(
-            continued(rows, self.sides, self.water) if any(self.sides) else rows, self.plane
-        )
+        plane = grid if self.cone else grid.slice
+        self.plan = FbpPlan(geometry, [plane], kernel, sides=sides, outside=water)
 
     def band(self, first: int, stop: int) -> tuple[int, int]:
         """Detector rows, or slices, that the slices ``first`` … ``stop - 1`` of the volume need."""
         if not self.cone:
             return first, stop
-        low, high = self.plan.rows(first, stop)
-        return self.window.first_row + low, self.window.first_row + high
+        low, high = self.plan.backprojections[0].rows(first, stop)
+        return self.plan.window.first_row + low, self.plan.window.first_row + high
 
     def needs(self, first: int, stop: int) -> int:
         """Bytes at most while a slab is made."""
         low, high = self.band(first, stop)
         rows = high - low + (2 * HALO if self.cone else 0)
         readings = 4 * rows * self.geometry.views * self.geometry.columns
-        wide = readings * self.wide.columns / self.geometry.columns
-        filtered = 4 * (high - low) * self.geometry.views * self.window.columns
+        completed = readings * self.plan.completed.columns / self.geometry.columns
+        filtered = 4 * (high - low) * self.geometry.views * self.plan.window.columns
         slab = 4 * (stop - first) * math.prod(self.grid.shape[1:])
-        return int(max(_READINGS * readings, 2 * wide + filtered, filtered + slab, _VOLUMES * slab))
+        return int(
+            max(_READINGS * readings, 2 * completed + filtered, filtered + slab, _VOLUMES * slab)
+        )
 
     def __call__(self, source: ScanSlices, first: int, stop: int) -> Tensor:
         """The slices ``first`` … ``stop - 1``, in the scan's unit."""
+        plan = self.plan
         low, high = self.band(first, stop)
         scan, own, *_ = source.read(low, high)
         lines, geometry = scan.line_integrals(), scan.geometry
         del scan
-        rows = self.complete(lines, geometry)
+        completed = plan.complete(lines, beam(geometry)).lines
         del lines
         _give_back()
-        held, wanted = DetectorWindow.full(self.wide), self.window
         if self.cone:
-            held = held.with_rows(low - own.start, rows.lines.shape[-2])
-            wanted = wanted.with_rows(low, high - low)
-        filtered = filter_sinogram(
-            rows.lines, self.wide, self.kernel, wanted, held=held, weights=rows.weights
-        )
-        del rows
-        place = ((first, stop), low - self.window.first_row) if self.cone else ()
-        mu = self.plan.forward(filtered, *place)
+            held = DetectorWindow.full(plan.completed)
+            held = held.with_rows(low - own.start, completed.shape[-2])
+            filtered = plan.filtered(completed, held, (low, high))
+            del completed
+            mu = plan.backprojections[0].forward(
+                filtered, (first, stop), low - plan.window.first_row
+            )
+        else:
+            filtered = plan.filtered(completed)
+            del completed
+            (mu,) = plan.backprojected(filtered)
         del filtered
         _give_back()
         return to_hu(mu, self.water).to(torch.float32)
@@ -421,7 +408,7 @@ def plan_slabs(
     base = resident_bytes() + _RESERVE
     free = available_bytes(torch.device("cpu")) // parts
     limit = memory_bytes(memory) if memory is not None else resident_bytes() + free
-    fbp = _Fbp(geometry, grid, "standard", sides, 0.02) if method == "fbp" else None
+    fbp = _SlabFbp(geometry, grid, "standard", sides, 0.02) if method == "fbp" else None
     needs = fbp.needs if fbp is not None else _pwls_needs(geometry, grid)
     total = grid.shape[0]
 
@@ -617,10 +604,10 @@ class _Maker:
         self.sides, self.options = sides, options
 
     @cached_property
-    def fbp(self) -> _Fbp | None:
+    def fbp(self) -> _SlabFbp | None:
         source = self.source
         return (
-            _Fbp(source.geometry, self.grid, self.kernel, self.sides, source.water)
+            _SlabFbp(source.geometry, self.grid, self.kernel, self.sides, source.water)
             if self.method == "fbp"
             else None
         )

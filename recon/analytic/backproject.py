@@ -228,6 +228,10 @@ class BackprojectionPlan:
             )
         )
 
+    def __call__(self, filtered: Tensor) -> Tensor:
+        """:meth:`forward`, differentiable, of data on any device."""
+        return apply_linear(filtered.cpu(), self.forward, self.transpose).to(filtered.device)
+
     def forward(
         self, data: Tensor, slices: tuple[int, int] | None = None, first_row: int = 0
     ) -> Tensor:
@@ -361,5 +365,4 @@ def backproject(
     if window is None:
         window = DetectorWindow.full(geometry)
     check_data("filtered", filtered, data_shape(geometry, window))
-    plan = BackprojectionPlan(geometry, grid, window, motion)
-    return apply_linear(filtered.cpu(), plan.forward, plan.transpose).to(filtered.device)
+    return BackprojectionPlan(geometry, grid, window, motion)(filtered)

@@ -20,13 +20,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.analytic.angular_weights import angular_weights
-from recon.analytic.backproject import BackprojectionPlan, backproject
-from recon.analytic.fbp import filter_sinogram
 from recon.analytic.filter_plan import FilterPlan
 from recon.analytic.inset import InsetFbp
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import RoiMean
 from torchpcct.scan import Scan
 from torchpcct.validate import checked
@@ -116,7 +112,7 @@ def roi_adjoints(clean: Scan, fbp: InsetFbp, rois: Sequence[Sequence[RoiMean]]) 
     Raises:
         ValueError: a scan that is not windowed.
     """
-    traces = [_traces(fbp, grid, r, clean) for grid, r in zip(fbp.grids, rois, strict=True)]
+    traces = [_traces(fbp, i, r, clean) for i, r in zip(range(len(fbp.grids)), rois, strict=True)]
     first = min(start for start, _ in traces)
     rows = max(start + trace.shape[-2] for start, trace in traces) - first
     window = _near(fbp, clean, first, rows)
@@ -151,8 +147,8 @@ def roi_covariance(
     """
     results = []
     # The vectors of many ROIs are large: one kernel at a time.
-    for grid, grid_rois in zip(fbp.grids, rois, strict=True):
-        first, trace = _traces(fbp, grid, grid_rois, clean)
+    for i, grid_rois in zip(range(len(fbp.grids)), rois, strict=True):
+        first, trace = _traces(fbp, i, grid_rois, clean)
         window = _near(fbp, clean, first, trace.shape[-2])
         variance = line_integral_variance(clean.crop(window), exposure_s)
         vectors = _filtered(fbp, trace, window, 1000.0 / fbp.linearisation.mu_ref)
@@ -195,9 +191,7 @@ def functional_covariance(
         raise ValueError(
             f"functionals must have the shape (n, *{grid.shape}), got {tuple(functionals.shape)}"
         )
-    traces = BackprojectionPlan(fbp.geometry, grid, fbp.footprint).transpose(
-        functionals.to(ray_covariance.dtype)
-    )
+    traces = fbp.plan.backprojections[0].transpose(functionals.to(ray_covariance.dtype))
     seen = w.with_rows(fbp.footprint.first_row, fbp.footprint.rows)
     (h,) = _filtered(fbp, traces, seen, 1.0)
     return np.stack([_gram(h, c) for c in w.crop(ray_covariance, seen)], axis=-1)
@@ -224,13 +218,12 @@ def voxel_covariance(clean: Scan, fbp: InsetFbp, exposure_s: float, voxel: Seque
         raise ValueError(
             "the covariance of a voxel needs FBP of one grid with one kernel, and a windowed scan"
         )
-    (grid,), window = fbp.grids, clean.window
+    window = clean.window
     variance = line_integral_variance(clean, exposure_s).to(torch.float32)
     hu = 1000.0 / fbp.linearisation.mu_ref
 
     def reconstruct(lines: Tensor) -> Tensor:
-        filtered = filter_sinogram(lines, fbp.geometry, fbp.kernels, fbp.footprint, held=window)
-        return backproject(filtered, fbp.geometry, grid, fbp.footprint)[0] * hu
+        return fbp.plan.backprojected(fbp.plan.filtered(lines, held=window))[0][0] * hu
 
     leaf = torch.zeros_like(variance, requires_grad=True)
     with torch.enable_grad():
@@ -239,17 +232,15 @@ def voxel_covariance(clean: Scan, fbp: InsetFbp, exposure_s: float, voxel: Seque
         return reconstruct(h * variance)
 
 
-def _traces(
-    fbp: InsetFbp, grid: VolumeGrid, rois: Sequence[RoiMean], clean: Scan
-) -> tuple[int, Tensor]:
-    """Transposed backprojection of ROI weights: first detector row, ``(rois, views, rows,
-    columns)`` of those seen.
+def _traces(fbp: InsetFbp, grid: int, rois: Sequence[RoiMean], clean: Scan) -> tuple[int, Tensor]:
+    """Transposed backprojection of ROI weights on one of the grids: first detector row, ``(rois,
+    views, rows, columns)`` of those seen.
 
     Filtering stays within a row, so the rows that no ROI sees are left out."""
-    if clean.window is None:
+    if clean.window is None or fbp.window is None:
         raise ValueError("the noise of ROI means needs a windowed scan: acquire it with region=")
-    spread = BackprojectionPlan(fbp.geometry, grid, fbp.footprint, fbp.motion).transpose
-    traces = spread(torch.stack([r.weights for r in rois]).to(clean.counts.dtype))
+    weights = torch.stack([r.weights for r in rois])
+    traces = fbp.moving.backprojections[grid].transpose(weights.to(clean.counts.dtype))
     seen = (traces != 0).sum((0, 1, 3)).nonzero()
     first, last = int(seen.min()), int(seen.max())
     return fbp.footprint.first_row + first, traces[:, :, first : last + 1].contiguous()
@@ -268,7 +259,7 @@ def _filtered(
     """``scale`` times the adjoint vectors of every kernel, ``(rois, views, rows, columns)`` on
     ``window``."""
     traced = fbp.footprint.with_rows(window.first_row, window.rows)
-    weights = angular_weights(fbp.geometry)
+    weights = fbp.plan.weights
     for kernel in fbp.kernels:
         plan = FilterPlan(fbp.geometry, (kernel,), weights, window, traced)
         yield torch.stack([plan.transpose(t[None]).mul_(scale) for t in traces])

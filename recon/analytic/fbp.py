@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from recon.analytic.angular_weights import angular_weights
 from recon.analytic.any_orbit import at_slices, rebin_to_circle
-from recon.analytic.backproject import backproject, check_data, data_shape
+from recon.analytic.backproject import BackprojectionPlan, backproject, check_data, data_shape
 from recon.analytic.coverage import check_rows, refuse_helix
 from recon.analytic.detector_edges import Rows, continued, cut_off, mirrored
 from recon.analytic.filter_plan import FilterPlan, kernel_names
@@ -30,7 +30,7 @@ from torchpcct.readings import bridge
 from torchpcct.validate import checked, number, reals
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["Fbp", "backproject", "fbp", "filter_sinogram", "interleave"]
+__all__ = ["Fbp", "FbpPlan", "backproject", "fbp", "filter_sinogram", "interleave"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -139,7 +139,7 @@ def interleave(sinogram: Tensor, geometry: G) -> tuple[Tensor, G]:
             rays); columns without the quarter offset (more than a tenth of a column from it).
         TypeError: a wrong dtype.
     """
-    check_data("sinogram", sinogram, data_shape(geometry, DetectorWindow.full(geometry)))
+    check_data("sinogram", sinogram, geometry.shape)
     _check_opposites(beam(geometry))
     # the mean of a reading and a zero is half the reading
     spread = torch.stack([2.0 * sinogram, torch.zeros_like(sinogram)], dim=-1).flatten(-2)
@@ -248,20 +248,139 @@ def fbp(
             motion=circle.motion,
             outside=outside,
         )
-    check_data("sinogram", sinogram, data_shape(geometry, DetectorWindow.full(geometry)))
+    check_data("sinogram", sinogram, geometry.shape)
     refuse_helix(geometry, motion)
     for text in check_rows(geometry, grid, motion):
         _LOG.warning("%s", text)
-    repaired = _without_dead(sinogram, geometry)
-    rows = _completed(
-        Rows(repaired, beam(geometry), _check_weights(weights, geometry, grid)),
-        grid,
-        motion,
-        outside,
+    lines = _without_dead(sinogram, geometry)
+    weights = _check_weights(weights, geometry, grid)
+    plan = FbpPlan(
+        geometry,
+        [grid],
+        kernel,
+        weights=weights,
+        motion=motion,
+        sides=_cut_sides(lines, beam(geometry), weights, outside),
+        outside=outside or 0.0,
     )
-    window = read_window(rows.geometry, grid, motion)
-    filtered = filter_sinogram(rows.lines, rows.geometry, kernel, window, weights=rows.weights)
-    return backproject(filtered, rows.geometry, grid, window, motion=motion)
+    return plan(lines)[0]
+
+
+class FbpPlan:
+    """The way from readings to volumes, of one geometry onto one or several grids: the rows are
+    completed, weighted and filtered, backprojected.
+
+    :func:`fbp` goes it with whole rows, :class:`recon.analytic.inset.InsetFbp` with the readings
+    of a window, :mod:`recon.slabs` with some rows at a time of a volume larger than memory.
+
+    Args:
+        geometry: parallel, fan or cone beam.
+        grids: voxels to reconstruct; each reads the same filtered data.
+        kernel: reconstruction kernel, or several.
+        weights: ``(views, 1)`` or ``(views, columns)`` rad; None:
+            :func:`recon.analytic.angular_weights.angular_weights`.
+        motion: displacement of the grids in every view, see :func:`backproject`.
+        sides: whether the rows end inside the object at the first and at the last column, and are
+            continued there by cylinders of ``outside`` (mm⁻¹).
+        window: the readings that are filtered, of rows that need no completion; None: the
+            footprint of the grids on the completed rows.
+
+    Attributes:
+        completed: geometry of the completed rows.
+        window: the readings of ``completed`` that are filtered.
+        backprojections: of each grid.
+    """
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        grids: Sequence[VolumeGrid],
+        kernel: str | Sequence[str] = "standard",
+        *,
+        weights: NDArray[np.float64] | None = None,
+        motion: Any = None,
+        sides: tuple[bool, bool] = (False, False),
+        outside: float = 0.0,
+        window: DetectorWindow | None = None,
+    ) -> None:
+        self.geometry, self.grids, self.kernel = beam(geometry), tuple(grids), kernel
+        self._sides, self._outside, self._whole_rows = sides, outside, window is None
+        self._travel = (
+            0.0
+            if motion is None
+            else float(np.hypot(*np.asarray(motion, dtype=np.float64)[:, -2:].T).max())
+        )
+        # What a grid needs of an offset detector's short scan is not known of several at once.
+        only = self.grids[0] if len(self.grids) == 1 else None
+        self.weights = angular_weights(geometry, only) if weights is None else weights
+        shape_only = self.complete(torch.empty(geometry.shape, device="meta"))
+        self.completed, self._completed_weights = shape_only.geometry, shape_only.weights
+        self.window = (
+            DetectorWindow.union(
+                [_footprint_or_all(self.completed, grid, motion) for grid in self.grids],
+                self.completed.columns,
+            )
+            if window is None
+            else window
+        )
+        self.backprojections = [
+            BackprojectionPlan(self.completed, grid, self.window, motion) for grid in self.grids
+        ]
+
+    def complete(self, lines: Tensor, geometry: Beam | None = None) -> Rows:
+        """Rows that end inside the object continued, those of an offset detector with zeros on the
+        short side.
+
+        Args:
+            lines: ``(..., views, [rows,] columns)``.
+            geometry: of a cone beam's lines that hold some of the rows; None: they hold all.
+        """
+        rows = Rows(lines, geometry or self.geometry, self.weights)
+        if any(self._sides):
+            rows = continued(rows, self._sides, self._outside)
+        if self._whole_rows:
+            for grid in self.grids:
+                rows = mirrored(rows, grid, self._travel)
+        return rows
+
+    def filtered(
+        self,
+        lines: Tensor,
+        held: DetectorWindow | None = None,
+        rows: tuple[int, int] | None = None,
+    ) -> Tensor:
+        """Completed rows, weighted and filtered, ``([kernels,] ..., views, [rows,] columns)``.
+
+        Args:
+            lines: ``(..., views, [rows,] columns)``.
+            held: the readings of the completed detector that ``lines`` holds; None: all.
+            rows: the first of the detector's rows that are wanted, and the one after the last;
+                None: those of the window.
+        """
+        window = self.window if rows is None else self.window.with_rows(rows[0], rows[1] - rows[0])
+        return filter_sinogram(
+            lines, self.completed, self.kernel, window, held=held, weights=self._completed_weights
+        )
+
+    def filtered_static(self, cells: Tensor) -> Tensor:
+        """:meth:`filtered` of readings ``(..., rows, columns)`` that are the same in every view."""
+        weights = self._completed_weights
+        if not np.allclose(weights, weights[0, 0], rtol=1e-6, atol=0):
+            views = (*cells.shape[:-2], *self.completed.shape)
+            return self.filtered(cells.unsqueeze(-3).expand(views))
+        one_view = self.completed.select([0])
+        filtered = filter_sinogram(
+            cells.unsqueeze(-3), one_view, self.kernel, weights=weights[:1, :1]
+        )
+        return self.window.take(filtered.squeeze(-3))
+
+    def backprojected(self, filtered: Tensor) -> list[Tensor]:
+        """The volumes on every grid, ``([kernels,] ..., *grid.shape)`` mm⁻¹."""
+        return [backprojection(filtered) for backprojection in self.backprojections]
+
+    def __call__(self, lines: Tensor) -> list[Tensor]:
+        """:meth:`backprojected` of line integrals of the whole detector."""
+        return self.backprojected(self.filtered(self.complete(lines).lines))
 
 
 class Fbp(nn.Module):
@@ -388,31 +507,29 @@ def _without_dead(sinogram: Tensor, geometry: Geometry) -> Tensor:
     return bridge(sinogram, dead, geometry.has_rows)
 
 
-def _completed(rows: Rows, grid: VolumeGrid, motion: Any, outside: float | None) -> Rows:
-    """Rows that end inside the object continued, those of an offset detector mirrored."""
-    known = rows.lines.numel() > 0 and not _transformed()
-    if (outside is None or number("outside", outside, low=0.0, unit="mm⁻¹") > 0) and known:
-        sides = cut_off(rows.lines, rows.geometry, rows.weights)
-        if any(sides) and outside is None:
-            warnings.warn(
-                "the rows end inside the object at the "
-                f"{' and the '.join(_SIDES[i] for i in (0, 1) if sides[i])} column: CT numbers "
-                "will be wrong, most near the edge of the field of view; pass outside= the "
-                "attenuation in mm⁻¹ of what lies beyond (0 to do without)",
-                UserWarning,
-                stacklevel=4,
-            )
-        rows = continued(rows, sides, outside or 0.0)
-    shift = (
-        0.0
-        if motion is None
-        else float(np.hypot(*np.asarray(motion, dtype=np.float64)[:, -2:].T).max())
-    )
-    return mirrored(rows, grid, shift)
+def _cut_sides(
+    lines: Tensor, geometry: Beam, weights: NDArray[np.float64], outside: float | None
+) -> tuple[bool, bool]:
+    """Where the rows end inside the object, as far as anything is to be done about it; a warning
+    where nobody said what lies beyond."""
+    if outside is not None and number("outside", outside, low=0.0, unit="mm⁻¹") == 0:
+        return False, False
+    if not lines.numel() or _transformed():
+        return False, False
+    sides = cut_off(lines, geometry, weights)
+    if any(sides) and outside is None:
+        warnings.warn(
+            "the rows end inside the object at the "
+            f"{' and the '.join(_SIDES[i] for i in (0, 1) if sides[i])} column: CT numbers "
+            "will be wrong, most near the edge of the field of view; pass outside= the "
+            "attenuation in mm⁻¹ of what lies beyond (0 to do without)",
+            UserWarning,
+            stacklevel=4,
+        )
+    return sides
 
 
-def read_window(geometry: Geometry, grid: VolumeGrid, motion: Any = None) -> DetectorWindow:
-    """The readings that are filtered for a grid: its footprint."""
+def _footprint_or_all(geometry: Geometry, grid: VolumeGrid, motion: Any) -> DetectorWindow:
     try:
         return footprint(geometry, grid, margin=1, motion=motion)
     except ValueError:

@@ -56,6 +56,14 @@ class FilterPlan:
     window_out: DetectorWindow
     samples: NDArray[np.float64] = field(init=False)
     cosine: NDArray[np.float64] = field(init=False)
+    by_matrix: bool = field(init=False)
+    """Whether a matrix product is cheaper than FFTs."""
+    _offset: NDArray[np.int64] = field(init=False)
+    """Position of the data of every view in a frame in which the results start at the same
+    place."""
+    _length: int = field(init=False)
+    """Width of that frame."""
+    _fft_size: int = field(init=False)
 
     def __post_init__(self) -> None:
         g, a, b = beam(self.geometry), self.window_in, self.window_out
@@ -87,32 +95,22 @@ class FilterPlan:
         samples = np.stack(
             [ramp_kernel(g.columns, pitch, k, equiangular=curved) * pitch for k in self.kernels]
         )
-        object.__setattr__(self, "samples", samples)
-        object.__setattr__(self, "cosine", cosine)
-
-    @property
-    def _offset(self) -> NDArray[np.int64]:
-        """Position of the data of every view in a frame in which the results start at the same
-        place."""
-        shift = self.window_in.first_column - self.window_out.first_column
-        return shift - shift.min()
-
-    @property
-    def _length(self) -> int:
-        """Width of that frame."""
-        return int(self._offset.max()) + self.window_in.columns
-
-    @property
-    def _fft_size(self) -> int:
-        return fast_length(self._length + self.window_out.columns - 1)
-
-    @property
-    def by_matrix(self) -> bool:
-        """Whether a matrix product is cheaper than FFTs."""
-        width, size, count = self.window_out.columns, self._fft_size, len(self.kernels)
-        gemm = 2.0 * self._length * width * count / _GEMM_FLOPS
-        fft = (1 + count) * 2.5 * size * math.log2(size) / _FFT_FLOPS
-        return gemm <= fft
+        shift = a.first_column - b.first_column
+        offset = shift - shift.min()
+        length = int(offset.max()) + a.columns
+        fft_size = fast_length(length + b.columns - 1)
+        count = len(self.kernels)
+        by_matrix_ns = 2.0 * length * b.columns * count / _GEMM_FLOPS
+        by_fft_ns = (1 + count) * 2.5 * fft_size * math.log2(fft_size) / _FFT_FLOPS
+        for name, value in (
+            ("samples", samples),
+            ("cosine", cosine),
+            ("by_matrix", by_matrix_ns <= by_fft_ns),
+            ("_offset", offset),
+            ("_length", length),
+            ("_fft_size", fft_size),
+        ):
+            object.__setattr__(self, name, value)
 
     @property
     def chunk(self) -> int:

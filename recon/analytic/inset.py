@@ -16,11 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.analytic.angular_weights import angular_weights
 from recon.analytic.any_orbit import ideal_circle
-from recon.analytic.backproject import backproject
 from recon.analytic.coverage import check_rows
-from recon.analytic.fbp import fbp, filter_sinogram
+from recon.analytic.fbp import FbpPlan, fbp
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
 from torchpcct.scan import Scan
@@ -75,23 +73,8 @@ def static_fbp(lines: Tensor, geometry: ConeBeam, grid: VolumeGrid) -> Tensor:
     Raises:
         ValueError: a wrong shape, a grid outside the field of view.
     """
-    part = footprint(geometry, grid, margin=1)
-    return backproject(_static(lines, geometry, "standard", part), geometry, grid, part)
-
-
-def _static(
-    lines: Tensor, geometry: ConeBeam, kernel: str | Sequence[str], part: DetectorWindow
-) -> Tensor:
-    """Filtered readings ``([kernels,] ..., views, rows, columns)`` on ``part`` of lines that all
-    views share."""
-    weights = angular_weights(geometry)
-    if not np.allclose(weights, weights[0, 0], rtol=1e-6, atol=0):
-        whole = lines.unsqueeze(-3).expand(*lines.shape[:-2], *geometry.shape)
-        return filter_sinogram(whole, geometry, kernel, part)
-    one = geometry.select([0])
-    return part.take(
-        filter_sinogram(lines.unsqueeze(-3), one, kernel, weights=weights[:1, :1]).squeeze(-3)
-    )
+    plan = FbpPlan(geometry, [grid], window=footprint(geometry, grid, margin=1))
+    return plan.backprojected(plan.filtered_static(lines))[0]
 
 
 @checked
@@ -133,6 +116,7 @@ class InsetFbp:
     Attributes:
         circle: the geometry that is filtered: that of the scan, or the ideal circle next to one
             given view by view.
+        plan, moving: of a windowed scan, the way of what stands still and of what moves.
 
     Args:
         scan: any scan of the family; its noise does not matter.
@@ -207,8 +191,16 @@ class InsetFbp:
                 f"surround must have the shape (channels, {cells[0]}, {cells[1]}), got "
                 f"{tuple(self._lines.shape)}"
             )
+        self.plan = FbpPlan(self.geometry, self.grids, self.kernels, window=self.footprint)
+        self.moving = (
+            self.plan
+            if motion is None
+            else FbpPlan(
+                self.geometry, self.grids, self.kernels, motion=motion, window=self.footprint
+            )
+        )
         # (kernels, [channels,] views, rows, columns) on the grids' footprint.
-        self._surround = _static(self._lines, self.geometry, self.kernels, self.footprint)
+        self._surround = self.plan.filtered_static(self._lines)
 
     def _require_slices(self, scan: Scan) -> None:
         if self.geometry.has_rows:
@@ -225,9 +217,7 @@ class InsetFbp:
     @cached_property
     def _rest(self) -> list[Tensor]:
         """The surround on every grid, per mm."""
-        return [
-            backproject(self._surround, self.geometry, grid, self.footprint) for grid in self.grids
-        ]
+        return self.plan.backprojected(self._surround)
 
     @undisturbed
     def images(self, lines: Tensor, outside: float | None = None) -> list[Tensor]:
@@ -245,10 +235,11 @@ class InsetFbp:
         Raises:
             ValueError, TypeError: a wrong shape or dtype.
         """
-        g, part = self.geometry, self.footprint
         if self.window is None or self._lines is None:
-            grids = self.grids if g.has_rows else [grid.slice for grid in self.grids]
-            return [fbp(lines, g, grid, self.kernels, outside=outside) for grid in grids]
+            grids = self.grids if self.geometry.has_rows else [grid.slice for grid in self.grids]
+            return [
+                fbp(lines, self.geometry, grid, self.kernels, outside=outside) for grid in grids
+            ]
         channels = tuple(self._lines.shape[:-2])
         if lines.ndim < 3 or tuple(lines.shape[lines.ndim - 3 - len(channels) : -3]) != channels:
             raise ValueError(
@@ -256,11 +247,11 @@ class InsetFbp:
                 f"{tuple(lines.shape)}"
             )
         difference = lines - self.window.take(self._lines.to(lines.dtype))
-        filtered = filter_sinogram(difference, g, self.kernels, part, held=self.window)
-        if self.motion is None:
+        filtered = self.plan.filtered(difference, held=self.window)
+        if self.moving is self.plan:
             filtered = filtered + self._over_batch(self._surround.to(lines.dtype), filtered)
-            return [backproject(filtered, g, grid, part) for grid in self.grids]
-        moving = [backproject(filtered, g, grid, part, motion=self.motion) for grid in self.grids]
+            return self.plan.backprojected(filtered)
+        moving = self.moving.backprojected(filtered)
         return [self._over_batch(rest, m) + m for rest, m in zip(self._rest, moving, strict=True)]
 
     @staticmethod
