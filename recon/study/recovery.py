@@ -10,20 +10,26 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+import torch
 
 from recon.evaluate.insertion import REFERENCE, ContrastRecovery, InsertedBall, contrast_recovery
 from recon.evaluate.names import check_method
 from recon.jobs.store import Pieces
+from recon.least_squares.inset_problem import InsetProblem
 from recon.study.paper import facts as paper
-from recon.study.paper.plaque_scan import duty, inset_grid
+from recon.study.paper.plaque_scan import duty
 from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.acquisition.acquire import acquire
+from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene
 from torchpcct.validate import number, numbers
 
 __all__ = ["Settings", "figures", "measure"]
+
+_EDGE_MM = 9.2
+"""Of the inset about the plaque, seen in every view."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +98,7 @@ def measure(
     ``rows`` of the data, one for each exposure, ball and method: ``exposure_s``, ``diameter_mm``,
     ``contrast_hu``, ``method``, ``recovered`` with its ``standard_error`` (over places and
     realisations), ``soft_fbp``, ``verdict`` (``less``, ``more`` or ``as much`` as soft FBP), and
-    how many ``balls`` there were.
+    how many ``balls`` there were. ``noise_scale_hu``: of each exposure.
     """
     s = settings
     pieces = Pieces(folder, s)
@@ -108,16 +114,28 @@ def measure(
     for exposure in s.exposures_s:
         of_draws = [found[exposure, seed] for seed in range(s.seed, s.seed + s.n)]
         rows += [_pooled(exposure, same) for same in zip(*of_draws, strict=True)]
-    return Measured(s, {"rows": rows, "reference": REFERENCE})
+    noise = _noise_scales(clean, _grid(s), s.exposures_s)
+    return Measured(s, {"rows": rows, "reference": REFERENCE, "noise_scale_hu": noise})
+
+
+def _grid(settings: Settings) -> VolumeGrid:
+    n = round(_EDGE_MM / settings.voxel_mm)
+    return VolumeGrid((n, n, n), settings.voxel_mm, plaque_scene()[1].position[::-1])
+
+
+def _noise_scales(clean: Scan, grid: VolumeGrid, exposures_s: Sequence[float]) -> list[float]:
+    """HU of the noise scale (:mod:`recon.data_term`) at each exposure."""
+    problem = InsetProblem(clean, grid)
+    nothing = torch.zeros(1, *grid.shape)
+    return [float(problem.term_of(nothing, e).in_noise_units().unit_hu) for e in exposures_s]
 
 
 def _clean(settings: Settings, pieces: Pieces) -> Scan:
     """The noise-free scan."""
-    scene, plaque = plaque_scene()
+    scene, _ = plaque_scene()
     scanner = presets.pcct(views=settings.views)
-    grid = inset_grid(plaque, settings.voxel_mm)
     on = duty(scanner, paper.FULL_VIEWS["PCCT"])
-    scan: Scan = pieces("scan", lambda: acquire(scene, scanner, region=grid, duty=on))
+    scan: Scan = pieces("scan", lambda: acquire(scene, scanner, region=_grid(settings), duty=on))
     return scan
 
 
@@ -138,7 +156,7 @@ def _rows(
     balls = [InsertedBall(*ball) for ball in s.balls]
     found = contrast_recovery(
         scan.with_noise(exposure_s, seed),
-        inset_grid(plaque_scene()[1], s.voxel_mm),
+        _grid(s),
         list(s.methods),
         balls,
         n=s.places,
