@@ -16,7 +16,7 @@ from recon.least_squares.pwls import PwlsOptions
 from recon.least_squares.reconstruct import reconstruct_pwls
 from recon.mbir.reconstruct import reconstruct_mbir
 from recon.metal import metal_warnings
-from recon.names import METHODS, split_method
+from recon.names import split_method
 from recon.result import Result, tested
 from torchpcct.checks.defects import dead_readings, repair_defects
 from torchpcct.checks.readings import reading_warnings
@@ -35,13 +35,13 @@ if TYPE_CHECKING:
     from recon.mbir.priors import Prior
     from recon.vessel.prior import VesselPrior
 
-__all__ = ["METHODS", "MethodOptions", "reconstruct", "require_light"]
+__all__ = ["MethodOptions", "reconstruct"]
 
 _LOG = logging.getLogger(__name__)
 
-# More zero counts than this, and the logarithm no longer describes the data: FBP and PWLS would be
-# guesswork.
 _STARVED = 0.5
+"""More zero counts than this, and the logarithm no longer describes the data: FBP and PWLS would be
+guesswork."""
 
 
 class MethodOptions(PwlsOptions, total=False):

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-__all__ = ["conjugate_gradient", "dot", "per_volume"]
+__all__ = ["conjugate_gradient"]
 
 
 def dot(a: Tensor, b: Tensor, axes: int) -> Tensor:

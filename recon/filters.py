@@ -44,12 +44,10 @@ __all__ = [
     "bm4d",
     "deepinv_denoiser",
     "denoised",
-    "denoiser_of",
     "flat_noise",
     "gaussian",
     "nlm",
     "perona_malik",
-    "places_of",
     "tv",
 ]
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.validate import checked
 
-__all__ = ["DENSEST_HU", "metal_warnings"]
+__all__ = ["metal_warnings"]
 
 DENSEST_HU = 3000.0
 """Enamel, the densest tissue. Titanium reads 16 000 HU."""

@@ -11,20 +11,7 @@ from typing import Any
 
 from torchpcct.validate import choice, meant, number
 
-__all__ = [
-    "CONTRASTS",
-    "FILTERS",
-    "KERNELS",
-    "METHODS",
-    "check_prior",
-    "filter_name",
-    "is_module_name",
-    "loaded",
-    "mbir_options",
-    "meant_method",
-    "split_energies",
-    "split_method",
-]
+__all__ = ["FILTERS", "KERNELS", "METHODS"]
 
 METHODS: tuple[str, ...] = ("fbp", "pwls", "mbir")
 """Of :func:`recon.reconstruct`."""

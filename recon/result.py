@@ -12,7 +12,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from torchpcct.metrics.residual_test import ResidualTest  # loads scipy.stats
 
-__all__ = ["RESIDUAL_TEST", "Result", "tested"]
+__all__ = ["Result"]
 
 _LOG = logging.getLogger(__name__)
 

@@ -10,19 +10,17 @@ from numpy.typing import NDArray
 
 from torchpcct.validate import checked
 
-__all__ = ["OPEN_GAP_STEPS", "SAME_VIEW", "is_offset", "view_steps"]
-
 Floats = NDArray[np.float64]
 
-# : A gap between neighbouring views counts as the end of the scan when it exceeds this many median
-# steps.
 OPEN_GAP_STEPS = 3.0
-# : Views closer than this share of the mean step are repetitions of one view (angles are stored
-# with few digits).
+"""A gap between neighbouring views counts as the end of the scan when it exceeds this many median
+steps."""
 SAME_VIEW = 0.02
-# : A detector is an offset one if it reaches farther to one side by more than this share of its
-# width.
+"""Views closer than this share of the mean step are repetitions of one view (angles are stored with
+few digits)."""
 OFFSET_SHARE = 0.02
+"""A detector is an offset one if it reaches farther to one side by more than this share of its
+width."""
 
 
 @checked

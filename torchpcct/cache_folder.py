@@ -12,8 +12,6 @@ import tempfile
 from contextlib import suppress
 from pathlib import Path
 
-__all__ = ["ensure_cache", "is_temporary", "private_folder"]
-
 _TEMPORARY = "torchpcct-kernels-"
 
 

@@ -33,18 +33,6 @@ if TYPE_CHECKING:
 
     from torchpcct.typing import Ints, Reals
 
-
-__all__ = [
-    "compound_poisson",
-    "draw",
-    "normal",
-    "poisson",
-    "seed_key",
-    "split",
-    "stream",
-    "thinned",
-]
-
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 """2⁶⁴ over the golden ratio: the increment of SplitMix64 (Steele, Lea and Flood 2014, OOPSLA)."""
 _MIX1 = np.uint64(0xBF58476D1CE4E5B9)

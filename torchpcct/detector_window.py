@@ -16,7 +16,7 @@ from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, bea
 from torchpcct.validate import checked, whole
 from torchpcct.vector_geometry import VectorGeometry, check_motion
 
-__all__ = ["NOISE_MARGIN_COLUMNS", "DetectorWindow", "footprint"]
+__all__ = ["DetectorWindow", "footprint"]
 
 NOISE_MARGIN_COLUMNS = 128
 """Columns kept on either side of a region's footprint. The ramp filter reaches further, but its

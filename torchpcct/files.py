@@ -27,24 +27,7 @@ from typing import Any
 
 from torchpcct.formats.hdf5 import require_inside
 
-__all__ = [
-    "LEFTOVER",
-    "VERSION",
-    "WriteError",
-    "abandoned",
-    "atomic_write",
-    "fingerprint",
-    "is_foreign",
-    "is_own_hdf5",
-    "marker",
-    "read_hdf5",
-    "require_folder",
-    "require_ordinary",
-    "require_writable",
-    "seal",
-    "speak_any_encoding",
-    "write_hdf5",
-]
+__all__ = ["WriteError"]
 
 LEFTOVER = re.compile(r"\.(?P<process>\d+)-(?P<machine>[0-9a-f]{6})-[0-9a-f]{8}\.part\.")
 """Names of what is being written begin so: the process, where it runs, and a number of this

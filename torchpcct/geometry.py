@@ -26,17 +26,7 @@ from numpy.typing import NDArray
 
 from torchpcct.validate import checked, choice, number, per_axis, whole
 
-__all__ = [
-    "Beam",
-    "ConeBeam",
-    "FanBeam",
-    "Geometry",
-    "ParallelBeam",
-    "VolumeGrid",
-    "beam",
-    "full_turn",
-    "view_step",
-]
+__all__ = ["Beam", "ConeBeam", "FanBeam", "Geometry", "ParallelBeam", "VolumeGrid", "full_turn"]
 
 Floats = NDArray[np.float64]
 

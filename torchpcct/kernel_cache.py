@@ -22,8 +22,6 @@ from typing import Any
 
 from torchpcct.cache_folder import private_folder
 
-__all__ = ["OURS", "announce_compilation", "compiled_once", "folders", "forget_outdated", "sources"]
-
 OURS = ("torchpcct.", "recon.", "train.")
 """What the names of our modules begin with."""
 

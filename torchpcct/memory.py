@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-__all__ = ["free_bytes"]
-
 
 def free_bytes() -> int:
     """Memory that can still be allocated: of the container, or of the machine."""

@@ -23,18 +23,7 @@ from torchpcct.scan_grid import cells_at_axis
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.validate import number
 
-__all__ = [
-    "MEDIAN_TO_SD",
-    "MOST_DEAD",
-    "TRANSFER_FRAMES",
-    "bridge",
-    "counted",
-    "dispersion",
-    "inverse_variance",
-    "log_bias",
-    "logged",
-    "smoothed",
-]
+__all__ = ["bridge", "dispersion", "inverse_variance", "log_bias"]
 
 _PSEUDO_DEPTH = 5.0
 """Line integral through as much water as all columns see at the axis, where a scan is not in HU.

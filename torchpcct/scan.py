@@ -26,7 +26,7 @@ from torchpcct.validate import UNITS, checked, choice, number, whole
 if TYPE_CHECKING:
     from torchpcct.scanner.scanner import Scanner
 
-__all__ = ["NOISE_FREE_EXPOSURE_S", "Scan", "check_exposure"]
+__all__ = ["Scan"]
 
 NOISE_FREE_EXPOSURE_S = 1.0
 """The exposure that the expected readings of a noise-free scan stand for."""

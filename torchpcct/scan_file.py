@@ -14,16 +14,6 @@ from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, Volume
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = [
-    "NoSlicesError",
-    "read_geometry",
-    "scan_fields",
-    "slice_axis",
-    "sliced",
-    "write_geometry",
-    "write_scan",
-]
-
 G = TypeVar("G", bound=Geometry)
 
 _VERSION = 5

@@ -15,8 +15,6 @@ from torchpcct.geometry import Beam, ConeBeam, Geometry, VolumeGrid
 from torchpcct.validate import number, numbers
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["cells_at_axis", "finite_cells", "grid_of"]
-
 Floats = NDArray[np.float64]
 
 _SLACK = 1e-6

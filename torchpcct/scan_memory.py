@@ -17,8 +17,6 @@ from torch import Tensor
 
 from torchpcct.scan import Scan
 
-__all__ = ["once"]
-
 T = TypeVar("T")
 
 MOST = 6

@@ -18,8 +18,6 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-__all__ = ["undisturbed", "unswitched"]
-
 _ERRORS = {"divide": "warn", "over": "warn", "under": "ignore", "invalid": "warn"}
 """As numpy has them."""
 _NOTHING = nullcontext()

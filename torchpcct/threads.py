@@ -14,7 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
 
-__all__ = ["get_num_threads", "run", "set_num_threads"]
+__all__ = ["get_num_threads", "set_num_threads"]
 
 _PIECES = 4
 """Pieces per thread at most: whoever is done takes the next, so that unequal work is shared."""

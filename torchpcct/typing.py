@@ -10,8 +10,6 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Bools", "Floats", "Ints", "Json", "Reals"]
-
 Bools: TypeAlias = NDArray[np.bool_]
 
 Floats: TypeAlias = NDArray[np.float64]

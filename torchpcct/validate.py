@@ -14,22 +14,6 @@ import numpy as np
 
 from torchpcct.switches import unswitched
 
-__all__ = [
-    "UNITS",
-    "broadcast",
-    "checked",
-    "choice",
-    "coverage",
-    "meant",
-    "memory_bytes",
-    "number",
-    "numbers",
-    "per_axis",
-    "reals",
-    "shaped",
-    "whole",
-]
-
 UNITS = ("HU", "mm^-1", "pixel^-1")
 """Of scans and volumes; of ``pixel^-1`` all lengths are in pixels."""
 

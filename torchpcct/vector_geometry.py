@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, beam
 from torchpcct.validate import checked, number, whole
 
-__all__ = ["VectorGeometry", "check_motion", "helical_motion", "split_motion"]
+__all__ = ["VectorGeometry", "helical_motion"]
 
 Floats = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ import numpy as np
 if TYPE_CHECKING:
     from torchpcct.volume import Volume
 
-__all__ = ["WINDOW_HU", "Panel", "base64_text", "panels", "viewer_page"]
+__all__ = ["Panel", "panels", "viewer_page"]
 
 WINDOW_HU = (150.0, 600.0)
 """Centre and width of the paper's display window (C150 / W600)."""

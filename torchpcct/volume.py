@@ -27,7 +27,7 @@ from torchpcct.formats.volume_slabs import read_ome_zarr, write_ome_zarr
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import UNITS, checked, choice
 
-__all__ = ["Volume", "check_volume_name", "from_hu", "in_words", "to_hu"]
+__all__ = ["Volume", "from_hu", "to_hu"]
 
 
 @checked

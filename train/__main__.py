@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from train.data import Data
     from train.objective import Objective
 
-__all__ = ["build", "main"]
-
 
 def _parser() -> Parser:
     from recon.cli.parsing import MOST, Parser, add_options

@@ -14,8 +14,6 @@ from torch import Tensor, nn
 from recon.mbir.weights_io import TensorFileError, read_tensors, write_tensors
 from torchpcct.files import LEFTOVER
 
-__all__ = ["CHECKPOINT_FORMAT", "CheckpointStore", "start_from"]
-
 CHECKPOINT_FORMAT = "torchpcct training checkpoint 2"
 UNFINISHED = "checkpoint.next.safetensors"
 

@@ -23,15 +23,7 @@ from torchpcct.formats.damage import yaml_values
 from torchpcct.validate import checked, number, numbers, whole
 from train.scenes.scene import SceneConfig
 
-__all__ = [
-    "DataConfig",
-    "ObjectiveConfig",
-    "Situation",
-    "TrainConfig",
-    "differences",
-    "load_config",
-    "packaged_config",
-]
+__all__ = ["DataConfig", "ObjectiveConfig", "TrainConfig", "load_config"]
 
 LONGEST_INTERVAL = 120.0
 """Largest ``checkpoint_seconds``: what a killed run may lose, in s."""

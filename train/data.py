@@ -48,7 +48,7 @@ from train.scenes.drawing import draw_scene
 from train.scenes.rasterise import rasterise
 from train.scenes.scene import SceneConfig
 
-__all__ = ["Batch", "Data", "Sample", "Views", "seed_of", "situation_term"]
+__all__ = ["Data"]
 
 
 def seed_of(*key: int | str) -> int:

@@ -18,8 +18,6 @@ from tqdm import tqdm
 
 from torchpcct.files import atomic_write
 
-__all__ = ["Logs", "Table"]
-
 logger = logging.getLogger(__name__)
 
 DARKEST_HU = -150.0

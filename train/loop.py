@@ -28,8 +28,6 @@ from train.objective import Objective
 from train.processes import Group, gradient
 from train.run import Run, State
 
-__all__ = ["train"]
-
 
 def train(
     config: TrainConfig,

@@ -38,8 +38,6 @@ from recon.mbir.unrolled import DEFAULT_FIDELITY, Views
 from train.config import ObjectiveConfig
 from train.data import Batch, Data
 
-__all__ = ["Loss", "Objective", "Validation"]
-
 _TAME_ERROR = 0.02
 _TAME_CONTRAST = 2.0
 """A few scenes (calcifications at high dose) would drown all others: losses beyond count less

@@ -22,8 +22,6 @@ if distributed.is_available():
     # now: it keeps the group that exists at its import, whose threads then abort the exit
     import torch.distributed.nn
 
-__all__ = ["Group", "gradient"]
-
 
 class Group:
     """The processes of a run: one, or those of an initialised ``torch.distributed`` (gloo)."""

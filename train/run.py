@@ -37,7 +37,7 @@ from train.logs import Logs
 from train.objective import Objective
 from train.processes import Group
 
-__all__ = ["DivergedError", "Run", "State", "export", "finite", "rate_factor"]
+__all__ = ["Run"]
 
 
 PATIENCE = 20

@@ -114,12 +114,13 @@ def _formula(self, node, block=False):
 
 def as_python_does(app, env, node, contnode):
     """A name that a docstring uses is what Python finds there: in the module, or handed on by a
-    package."""
+    package. One that is not public leads to the text of its module."""
     if node.get("refdomain") != "py":
         return None
     target, inside = node["reftarget"], [node.get("py:module"), None]
     if node.get("py:class"):
         inside.insert(0, f"{node['py:module']}.{node['py:class']}")
+    internal = None
     for where in inside:
         parts = [*(where.split(".") if where else []), *target.split(".")]
         for cut in range(len(parts) - 1, 0, -1):
@@ -129,9 +130,12 @@ def as_python_does(app, env, node, contnode):
                 for part in rest[:-1]:
                     owner = getattr(owner, part)
                 if isinstance(owner, ModuleType):
-                    full = ".".join(canonical(owner.__name__, name))
+                    home, name = canonical(owner.__name__, name)
+                    full = f"{home}.{name}"
                 else:
-                    full = f"{owner.__module__}.{owner.__qualname__}.{name}"
+                    home, full = owner.__module__, f"{owner.__module__}.{owner.__qualname__}.{name}"
+                    if not (hasattr(owner, name) or re.search(rf"\b{name}\b", owner.__doc__ or "")):
+                        continue
             except (ImportError, AttributeError, LookupError, TypeError):
                 continue
             domain = env.domains["py"]
@@ -140,7 +144,11 @@ def as_python_does(app, env, node, contnode):
             )
             if found is not None:
                 return found
-    return None
+            internal = internal or home
+    if internal is None:
+        return None
+    domain = env.domains["py"]
+    return domain.resolve_xref(env, node["refdoc"], app.builder, "mod", internal, node, contnode)
 
 
 def setup(app):

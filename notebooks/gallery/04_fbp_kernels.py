@@ -8,7 +8,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import recon
-from recon.analytic.ramp import KERNELS, apodization
+from recon.analytic.ramp import apodization
+from recon.names import KERNELS
 from torchpcct import VolumeGrid, acquire
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene

@@ -18,24 +18,24 @@ from torchpcct.angles import OPEN_GAP_STEPS, SAME_VIEW, is_offset, view_steps
 from torchpcct.geometry import Geometry, ParallelBeam, VolumeGrid, beam
 from torchpcct.validate import checked
 
-__all__ = ["angular_weights", "check_gaps", "offset_share", "parker_share"]
+__all__ = ["angular_weights"]
 
 _LOG = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
 
-# : A parallel-beam scan may lack this angle in rad before it is refused; below it the neighbours
-# fill in.
 PARALLEL_GAP_RAD = math.radians(5.0)
-# : Views that lack inside of the covered arc: neighbours stand for them up to this angle in rad,
-# with a warning.
+"""A parallel-beam scan may lack this angle in rad before it is refused; below it the neighbours
+fill in."""
 INNER_GAP_RAD = math.radians(5.0)
-# : A short scan may lack this angle in rad, or one step if that is less, of half a turn and the
-# fan: lines at the fan's : edge are not measured then.
+"""Views that lack inside of the covered arc: neighbours stand for them up to this angle in rad,
+with a warning."""
 SHORT_RAD = math.radians(2.0)
-# : The largest angle in rad that one view may stand for: five views a turn pass, as a test of
-# operators, not of images.
+"""A short scan may lack this angle in rad, or one step if that is less, of half a turn and the fan:
+lines at the fan's edge are not measured then."""
 WIDEST_STEP_RAD = math.radians(75.0)
+"""The largest angle in rad that one view may stand for: five views a turn pass, as a test of
+operators, not of images."""
 
 
 @checked

@@ -23,7 +23,7 @@ from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, Volume
 from torchpcct.validate import checked, whole
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["IdealCircle", "at_slices", "ideal_circle", "rebin_to_circle"]
+__all__ = ["IdealCircle", "ideal_circle", "rebin_to_circle"]
 
 Floats = NDArray[np.float64]
 

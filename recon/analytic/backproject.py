@@ -19,21 +19,21 @@ from torchpcct.threads import run
 from torchpcct.validate import checked
 from torchpcct.vector_geometry import check_motion
 
-__all__ = ["BackprojectionPlan", "backproject", "check_data", "data_shape"]
+__all__ = ["backproject"]
 
 _KIND = {"parallel": 0, "flat": 1, "curved": 2}
-# : Voxel columns of one task of the 3-D backprojection: small enough for the caches, large enough
-# to share look-ups.
 _TILES = ((12, 24), (8, 12))
-# : Polynomial lengths of the arc tangent, for usual fans and for half-fans near 90°: one compiled
-# variant each.
+"""Voxel columns of one task of the 3-D backprojection: small enough for the caches, large enough to
+share look-ups."""
 _ATAN_TERMS = {torch.float32: (7, 20), torch.float64: (12, 20)}
-# : Errors of the fan angle, in columns, at which the longer polynomial takes over: far below
-# rounding.
+"""Polynomial lengths of the arc tangent, for usual fans and for half-fans near 90°: one compiled
+variant each."""
 _ATAN_TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-11}
-# : Rows of a slab at least: products of a matrix with fewer rows are summed in another order by
-# some libraries.
+"""Errors of the fan angle, in columns, at which the longer polynomial takes over: far below
+rounding."""
 _FEWEST_ROWS = 8
+"""Rows of a slab at least: products of a matrix with fewer rows are summed in another order by some
+libraries."""
 
 
 @functools.lru_cache(maxsize=64)

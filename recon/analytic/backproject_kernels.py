@@ -18,8 +18,6 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-__all__ = ["ROWS", "backproject_2d", "backproject_3d", "spread_2d", "spread_3d"]
-
 PARALLEL = 0
 """Kind of a parallel beam."""
 FLAT = 1

@@ -20,7 +20,7 @@ from torchpcct.scan import Scan
 from torchpcct.validate import checked
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["check_rows", "consistency_warnings", "refuse_helix", "sampling_warnings", "view_notes"]
+__all__ = ["consistency_warnings"]
 
 STREAK_CELLS = 10.0
 """Distance between the paths of neighbouring views at the border of the field of view, in cells at

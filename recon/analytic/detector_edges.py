@@ -22,8 +22,6 @@ from torchpcct.geometry import Beam, ConeBeam, Geometry, ParallelBeam, VolumeGri
 from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.validate import checked
 
-__all__ = ["Rows", "continued", "cut_off", "ends_cut_off", "mirrored", "reach", "row_ends"]
-
 Floats = NDArray[np.float64]
 G = TypeVar("G", bound=Geometry)
 

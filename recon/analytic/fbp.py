@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from recon.analytic.angular_weights import angular_weights
 from recon.analytic.any_orbit import at_slices, rebin_to_circle
-from recon.analytic.backproject import BackprojectionPlan, backproject, check_data, data_shape
+from recon.analytic.backproject import BackprojectionPlan, check_data, data_shape
 from recon.analytic.coverage import check_rows, refuse_helix
 from recon.analytic.detector_edges import Rows, continued, cut_off, mirrored
 from recon.analytic.filter_plan import FilterPlan, kernel_names
@@ -30,7 +30,7 @@ from torchpcct.readings import bridge
 from torchpcct.validate import checked, number, reals
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["Fbp", "FbpPlan", "backproject", "fbp", "filter_sinogram", "interleave"]
+__all__ = ["Fbp", "FbpPlan", "fbp", "filter_sinogram", "interleave"]
 
 _LOG = logging.getLogger(__name__)
 

@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-__all__ = ["align", "unalign"]
-
 _OPTIONS: Any = {"nogil": True, "cache": True, "error_model": "numpy"}
 
 

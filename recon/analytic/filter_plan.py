@@ -23,11 +23,9 @@ from torchpcct.geometry import Geometry, ParallelBeam, beam
 from torchpcct.threads import run
 from torchpcct.validate import shaped
 
-__all__ = ["CHUNK_BYTES", "FilterPlan"]
-
-# : Intermediate results of filtering are kept near this size; larger scans are processed in chunks
-# of views.
 CHUNK_BYTES = 48 * 2**20
+"""Intermediate results of filtering are kept near this size; larger scans are processed in chunks
+of views."""
 # : Matrix products and FFTs per nanosecond on a common core, only used to choose the faster of the
 # two.
 _GEMM_FLOPS = 40.0

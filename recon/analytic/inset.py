@@ -27,7 +27,7 @@ from torchpcct.switches import undisturbed
 from torchpcct.validate import checked, number
 from torchpcct.volume import to_hu
 
-__all__ = ["InsetFbp", "require_inside", "static_fbp", "view_motion"]
+__all__ = ["InsetFbp", "static_fbp", "view_motion"]
 
 
 SAME_SURROUND = 1e-4

@@ -17,7 +17,7 @@ from scipy.fft import next_fast_len
 from recon.names import KERNELS
 from torchpcct.validate import checked, choice
 
-__all__ = ["apodization", "fast_length", "ramp_kernel"]
+__all__ = ["apodization", "ramp_kernel"]
 
 Floats = NDArray[np.float64]
 

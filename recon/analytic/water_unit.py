@@ -18,8 +18,6 @@ from recon.analytic.filter_plan import FilterPlan
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import FanBeam, Geometry, ParallelBeam, VolumeGrid, beam
 
-__all__ = ["unit_warnings"]
-
 _UNITS = {
     10.0: "is mu_water given in cm⁻¹?",
     100.0: "was mu_water converted from cm⁻¹ the wrong way?",

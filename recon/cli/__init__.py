@@ -46,9 +46,6 @@ from recon.cli.starting import add_demo, add_doctor, add_train, demo_steps, trai
 from torchpcct import __version__
 from torchpcct.files import WriteError, speak_any_encoding
 
-__all__ = ["main"]
-
-
 _GROUPS = {
     "begin": (add_demo, add_doctor),
     "simulate and reconstruct": (

@@ -17,8 +17,6 @@ from pathlib import Path
 from torchpcct import VolumeGrid, __version__
 from torchpcct.files import require_writable
 
-__all__ = ["outcomes"]
-
 _MODULES = {
     "scikit-image": "skimage",
     "pyyaml": "yaml",

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from recon.study.study import ProgressBars
     from torchpcct.volume import Volume
 
-__all__ = ["add_info", "add_view"]
-
 _PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 """Endings of pictures."""
 _LEAST_HU = 20.0

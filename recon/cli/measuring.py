@@ -36,17 +36,6 @@ if TYPE_CHECKING:
     from recon.study.study import ProgressBars
     from torchpcct.geometry import VolumeGrid
 
-__all__ = [
-    "add_compare",
-    "add_dose_factor",
-    "add_evaluate",
-    "add_hardcases",
-    "add_recovery",
-    "add_show_task",
-    "add_study",
-    "add_verify",
-]
-
 _STUDY_TASKS = (
     "plaque",
     "half_contrast",

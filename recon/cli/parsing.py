@@ -20,39 +20,6 @@ from typing import Any, NoReturn
 from torchpcct.files import WriteError, atomic_write, require_folder, require_writable
 from torchpcct.validate import meant, number, numbers, whole
 
-__all__ = [
-    "EXPOSURE",
-    "FORCE",
-    "LENGTH",
-    "MANY",
-    "MOST",
-    "PLACE",
-    "SCAN_ENDINGS",
-    "Commands",
-    "Ended",
-    "Parser",
-    "add_execution",
-    "add_options",
-    "as_json",
-    "as_options",
-    "check_ending",
-    "check_limits",
-    "check_output",
-    "check_results",
-    "command",
-    "ending_by_signals",
-    "examples",
-    "executing",
-    "find_modules_here",
-    "is_path",
-    "is_picture",
-    "length_of",
-    "map_beside",
-    "saying",
-    "tell",
-    "without_ending",
-]
-
 SCAN_ENDINGS = (".h5", ".hdf5")
 """Endings of scan files."""
 _BESIDE = (".json", ".yaml")

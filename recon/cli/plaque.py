@@ -15,8 +15,6 @@ from torchpcct.validate import number
 if TYPE_CHECKING:
     from recon.study.study import ProgressBars
 
-__all__ = ["add_plaque"]
-
 
 def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     for name in ("wall", "fibrous"):

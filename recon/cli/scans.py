@@ -54,16 +54,6 @@ if TYPE_CHECKING:
     from torchpcct.acquisition.config import SimulationConfig
     from torchpcct.scene.voxels import VoxelScene
 
-__all__ = [
-    "add_lower_dose",
-    "add_reader_options",
-    "add_reconstruct",
-    "add_show_config",
-    "add_simulate",
-    "grid_of_scan",
-    "reader_options",
-]
-
 _PAPER_VIEWS = 1968
 """Views of a turn in the paper."""
 MOST_VOXELS = 2**31

@@ -17,8 +17,6 @@ from typing import Any
 from recon.cli.parsing import FORCE, Commands, add_options, examples
 from torchpcct.files import require_writable
 
-__all__ = ["add_demo", "add_doctor", "add_train", "demo_steps", "train"]
-
 _DEMO_VIEWS = 984
 
 

@@ -27,12 +27,13 @@ if TYPE_CHECKING:
         InsertedBall,
         contrast_recovery,
     )
-    from recon.evaluate.methods import Method, deepinv_denoiser, denoiser, method_of
+    from recon.evaluate.methods import Method, denoiser, method_of
     from recon.evaluate.names import TASKS
     from recon.evaluate.report import save
     from recon.evaluate.task import Task
     from recon.evaluate.tasks import read_task
     from recon.evaluate.without_truth import evaluate_scans, evaluate_volumes
+    from recon.filters import deepinv_denoiser
 
 __all__ = [
     "TASKS",
@@ -54,14 +55,15 @@ __all__ = [
 ]
 
 _SOURCES = {
-    "insertion": ("ContrastRecovery", "InsertedBall", "contrast_recovery"),
-    "experiment": ("Evaluation", "evaluate", "export_scans"),
-    "names": ("TASKS",),
-    "methods": ("Method", "deepinv_denoiser", "denoiser", "method_of"),
-    "report": ("save",),
-    "task": ("Task",),
-    "tasks": ("read_task",),
-    "without_truth": ("evaluate_scans", "evaluate_volumes"),
+    "recon.evaluate.insertion": ("ContrastRecovery", "InsertedBall", "contrast_recovery"),
+    "recon.evaluate.experiment": ("Evaluation", "evaluate", "export_scans"),
+    "recon.evaluate.names": ("TASKS",),
+    "recon.evaluate.methods": ("Method", "denoiser", "method_of"),
+    "recon.evaluate.report": ("save",),
+    "recon.evaluate.task": ("Task",),
+    "recon.evaluate.tasks": ("read_task",),
+    "recon.evaluate.without_truth": ("evaluate_scans", "evaluate_volumes"),
+    "recon.filters": ("deepinv_denoiser",),
 }
 
 
@@ -69,5 +71,5 @@ def __getattr__(name: str) -> Any:
     """A name of another module, which loads (torch, numba) when the name is first used."""
     for module, names in _SOURCES.items():
         if name in names:
-            return getattr(importlib.import_module(f"recon.evaluate.{module}"), name)
+            return getattr(importlib.import_module(module), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -27,7 +27,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.scene.plaque import Plaque
 from torchpcct.validate import choice
 
-__all__ = ["ANATOMIES", "TISSUES_HU", "Anatomy", "AnatomyPart", "anatomy"]
+__all__ = ["ANATOMIES", "Anatomy", "AnatomyPart", "anatomy"]
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

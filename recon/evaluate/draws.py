@@ -34,8 +34,6 @@ from recon.mbir.mbir import Mbir
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 
-__all__ = ["Draws", "Simulated"]
-
 _SIGMA_SEEDS = (900_001, 900_002)
 """Draws that a denoiser's noise level is measured on; none of them is evaluated."""
 

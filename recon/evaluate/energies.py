@@ -38,8 +38,6 @@ from torchpcct.scene.materials import Material, material
 from torchpcct.scene.scene import Scene
 from torchpcct.spectral.weighting import BinWeights, bin_weights, weighted_sum
 
-__all__ = ["BINS", "EnergyDraws", "contrast_of", "mean_paths", "with_bins"]
-
 BINS = "bins"
 """Folder of a task's noise-free scans in energy bins."""
 _DIRECTIONS = 72

@@ -35,7 +35,7 @@ from recon.jobs.store import Store
 from torchpcct.files import atomic_write
 from torchpcct.validate import checked, numbers, whole
 
-__all__ = ["Evaluation", "TaskResult", "evaluate", "export_scans", "measured_before"]
+__all__ = ["Evaluation", "TaskResult", "evaluate", "export_scans"]
 
 log = logging.getLogger(__name__)
 

@@ -27,8 +27,6 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.observer import dog_channels, template_channel
 from torchpcct.volume import Volume
 
-__all__ = ["BLOCK", "Measurement", "Reader", "Readings", "kept_as", "volume_of"]
-
 Floats = NDArray[np.float64]
 
 BLOCK = 8

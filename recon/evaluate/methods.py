@@ -40,7 +40,7 @@ from torch import Tensor, nn
 
 from recon.evaluate.names import check_method
 from recon.evaluate.rivals import tuned
-from recon.filters import FILTERS, SMOOTHED_BY, deepinv_denoiser, denoiser_of, flat_noise
+from recon.filters import FILTERS, SMOOTHED_BY, denoiser_of, flat_noise
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import bilateral_prior
 from recon.mbir.priors import PlugAndPlay, prior_of
@@ -51,16 +51,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.volume import Volume
 
-__all__ = [
-    "Method",
-    "Realisation",
-    "deepinv_denoiser",
-    "denoiser",
-    "method_of",
-    "names_module",
-    "same_grid",
-    "volume_files",
-]
+__all__ = ["Method", "Realisation", "denoiser", "method_of"]
 
 
 class Realisation(Protocol):

@@ -20,7 +20,7 @@ from recon.names import (
 )
 from torchpcct.validate import choice
 
-__all__ = ["TASKS", "check_method", "check_task"]
+__all__ = ["TASKS"]
 
 _FOLDER = resources.files("recon") / "evaluate" / "tasks"
 TASKS: tuple[str, ...] = tuple(

@@ -25,18 +25,7 @@ from recon.evaluate.experiment import Evaluation, TaskResult
 from torchpcct.files import atomic_write
 from torchpcct.viz import base64_text
 
-__all__ = [
-    "filled",
-    "measured_text",
-    "page",
-    "plain",
-    "save",
-    "save_measured",
-    "task_sections",
-    "templates",
-    "text_of",
-    "write_report",
-]
+__all__ = ["save", "text_of"]
 
 COLUMNS = ("task", "method", "exposure_s", "figure", "where", "value", "low", "high", "unit", "n")
 _WINDOW_HU = (-160.0, 240.0)

@@ -23,8 +23,6 @@ from recon.data_term import Quadratic
 from recon.least_squares.inset_problem import InsetProblem
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 
-__all__ = ["response", "statistic_covariance"]
-
 _DRAWS = 2
 """Of the noise that the gradient is averaged over."""
 _SEED = 1 << 40

@@ -11,31 +11,10 @@ from typing import Any
 
 from recon.filters import (
     FILTERS,
-    SMOOTHED_BY,
-    bilateral,
-    bm4d,
-    denoised,
-    flat_noise,
-    gaussian,
-    nlm,
-    perona_malik,
-    tv,
 )
 from torchpcct.validate import checked, choice, number
 
-__all__ = [
-    "FILTERS",
-    "SMOOTHED_BY",
-    "bilateral",
-    "bm4d",
-    "denoised",
-    "flat_noise",
-    "gaussian",
-    "nlm",
-    "perona_malik",
-    "tuned",
-    "tv",
-]
+__all__ = ["tuned"]
 
 
 @cache

@@ -46,7 +46,7 @@ from torchpcct.scanner.scanner import Scanner
 from torchpcct.scene.scene import Scene
 from torchpcct.validate import numbers
 
-__all__ = ["BESIDE_MM", "ROIS", "Facts", "SomeViews", "Task", "contrast_limit"]
+__all__ = ["Task"]
 
 Floats = NDArray[np.float64]
 Pair = tuple[Tensor, Tensor]

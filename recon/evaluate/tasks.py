@@ -34,15 +34,7 @@ from torchpcct.scene.scene import Scene
 from torchpcct.validate import choice, number, numbers, whole
 from torchpcct.volume import Volume
 
-__all__ = [
-    "AnatomyTask",
-    "VesselTask",
-    "VoxelTask",
-    "read_task",
-    "task_text",
-    "with_painted",
-    "without_inset",
-]
+__all__ = ["AnatomyTask", "VesselTask", "VoxelTask", "read_task"]
 
 Floats = NDArray[np.float64]
 

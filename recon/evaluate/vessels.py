@@ -22,8 +22,6 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.scene import Scene
 from torchpcct.scene.plaque import Plaque, plaque_scene
 
-__all__ = ["LENGTH_MM", "SHAPES", "Branch", "PaintedVessel", "VesselAxis"]
-
 Floats = NDArray[np.float64]
 
 LENGTH_MM = 8.0

@@ -33,7 +33,7 @@ from torchpcct.scan import Scan
 from torchpcct.scan_grid import cells_at_axis, finite_cells
 from torchpcct.validate import checked, whole
 
-__all__ = ["MeasuredDraw", "evaluate_scans", "evaluate_volumes"]
+__all__ = ["evaluate_scans", "evaluate_volumes"]
 
 Record = dict[str, Any]
 _REFERENCE = "fbp:ram-lak"

@@ -37,14 +37,7 @@ from torchpcct.switches import undisturbed
 from torchpcct.threads import run
 from torchpcct.validate import number
 
-__all__ = [
-    "REFERENCE_FREQUENCY",
-    "Gram",
-    "check_weights",
-    "cholesky",
-    "information_at",
-    "make_definite",
-]
+__all__ = ["Gram"]
 
 # Frequencies in plane that are not made definite, in steps of the padded grid's, and at most in
 # periods per voxel. With them changed as well, the error on a vessel was 0.25 % (1968 views of the
@@ -52,8 +45,8 @@ __all__ = [
 # least eigenvalue on the grid is the same.
 LOW = 6.0
 LOW_PER_VOXEL = 0.06
-# Smallest pivot, as a share of the diagonal, that a definite spectrum must have.
 LEAST_PIVOT = 1e-4
+"""Smallest pivot, as a share of the diagonal, that a definite spectrum must have."""
 # Stiffness added between two neighbouring slices at a time, as a share of the mean diagonal, and
 # how often per frequency. Indefinite modes alternate from slice to slice, so this leaves objects
 # that are smooth along z alone.
@@ -145,18 +138,18 @@ def _points(terms: int) -> NDArray[np.float64]:
     )
 
 
-# Bands along z whose energy is below this share of the kernel's are dropped (float32 rounding).
 BAND_ENERGY = 1e-13
+"""Bands along z whose energy is below this share of the kernel's are dropped (float32 rounding)."""
 # Usual frequency of `information`, line pairs per mm, and the share of it by which others are still
 # averaged over.
 REFERENCE_FREQUENCY = 0.5
 AROUND = 0.2
-# Highest frequency per voxel that is looked at: beyond, the corners of the voxels' own spectrum say
-# little, and may be negative.
 HIGHEST_PER_VOXEL = 0.25
-# Of the information that a voxel's own response stands for: less is rounding, or cut off with the
-# grid.
+"""Highest frequency per voxel that is looked at: beyond, the corners of the voxels' own spectrum
+say little, and may be negative."""
 LEAST_INFORMATION = 0.1
+"""Of the information that a voxel's own response stands for: less is rounding, or cut off with the
+grid."""
 
 
 class Gram:

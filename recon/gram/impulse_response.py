@@ -17,8 +17,6 @@ from torch import Tensor
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
 
-__all__ = ["Nodes", "kernel_at", "node_positions", "slice_reach"]
-
 Nodes = tuple[tuple[float, float], ...]
 
 

@@ -12,16 +12,13 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-__all__ = ["banded_add", "banded_cholesky", "damp", "stiffen"]
-
-
-# It allocates nothing, and needs no reference counts.
 _VIEWS_ONLY: Any = {
     "nogil": True,
     "cache": True,
     "fastmath": {"contract", "reassoc", "nsz"},
     "_nrt": False,
 }
+"""It allocates nothing, and needs no reference counts."""
 
 
 @njit(**_VIEWS_ONLY)

@@ -55,21 +55,7 @@ from torchpcct.files import VERSION, WriteError, atomic_write, is_foreign, marke
 from torchpcct.kernel_cache import compiled_once
 from torchpcct.validate import whole
 
-__all__ = [
-    "Cluster",
-    "Job",
-    "LeftOut",
-    "Planned",
-    "Planner",
-    "Processes",
-    "Unfit",
-    "Unportable",
-    "current",
-    "heard",
-    "packed_call",
-    "run",
-    "using",
-]
+__all__ = ["Cluster", "Job", "LeftOut", "Processes", "Unfit", "Unportable", "using"]
 
 log = logging.getLogger(__name__)
 

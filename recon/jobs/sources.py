@@ -13,8 +13,6 @@ from typing import Any
 from torchpcct.files import VERSION
 from torchpcct.kernel_cache import OURS
 
-__all__ = ["source_digest"]
-
 _DATA = ("weights/*.safetensors", "*.json")
 """Files that modules of a folder read."""
 _ROOT = Path(__file__).parents[2]

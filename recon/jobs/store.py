@@ -26,8 +26,6 @@ from torchpcct.files import LEFTOVER, abandoned, atomic_write, is_foreign, read_
 if TYPE_CHECKING:
     from torchpcct.scan import Scan
 
-__all__ = ["Pieces", "Store", "packed", "unpacked", "was_kept"]
-
 log = logging.getLogger(__name__)
 
 

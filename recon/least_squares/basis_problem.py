@@ -37,7 +37,7 @@ from torchpcct.scan import Scan
 from torchpcct.spectral import SpectralModel, cramer_rao, decompose_surround, inverse, vmi_weights
 from torchpcct.validate import number
 
-__all__ = ["REFERENCE_KEV", "BasisProblem", "Whitening"]
+__all__ = ["BasisProblem", "Whitening"]
 
 
 Floats = NDArray[np.float64]

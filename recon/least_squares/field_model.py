@@ -32,23 +32,21 @@ from recon.gram.gram import REFERENCE_FREQUENCY, check_weights, information_at
 from recon.least_squares.model_solver import mean_share
 from recon.least_squares.qggmrf import BoundPrior
 
-__all__ = ["FieldModel", "GradientStep"]
-
-# Smallest eigenvalue of K, as a share of the median one: between the views' directions it is 0 or,
-# cut off, negative.
 LEAST = 0.02
+"""Smallest eigenvalue of K, as a share of the median one: between the views' directions it is 0 or,
+cut off, negative."""
 # Slices that have a K of their own, if waves along z are seen in the outermost of them by this
 # factor less than in the middle.
 NODES = 5
 FACTOR = 3.0
-# Voxels that fewer rays meet than this share of those through the middle are not determined by the
-# data. (A ring beyond the field of view, seen by three quarters of the views, converged a hundred
-# pairs later than all within.)
 DETERMINED = 0.9
-# Voxels that fewer rays meet are scaled as if it were this share, of the same mean weight: scaled
-# by themselves, slices beyond the rows of a cone beam hang on the prior alone and spoil the
-# condition number.
+"""Voxels that fewer rays meet than this share of those through the middle are not determined by the
+data. (A ring beyond the field of view, seen by three quarters of the views, converged a hundred
+pairs later than all within.)"""
 LEAST_MET = 0.5
+"""Voxels that fewer rays meet are scaled as if it were this share, of the same mean weight: scaled
+by themselves, slices beyond the rows of a cone beam hang on the prior alone and spoil the condition
+number."""
 
 
 class FieldModel:

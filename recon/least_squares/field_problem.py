@@ -31,11 +31,11 @@ from torchpcct.volume import in_words, to_hu
 if TYPE_CHECKING:
     from torchpcct.metrics.residual_test import ResidualTest
 
-__all__ = ["FieldProblem", "field_prior", "is_whole_field"]
+__all__ = ["FieldProblem"]
 
 REFERENCE_VOXEL_MM = 0.25
-# Distance from the minimum, beyond the field of view, from which it is named.
 UNDETERMINED_HU = 10.0
+"""Distance from the minimum, beyond the field of view, from which it is named."""
 # Readings that miss the grid see something if the mean of a patch of so many cells each way is
 # above this line integral (half a millimetre of water) and this share of the mean of the readings
 # that meet it.

@@ -14,13 +14,11 @@ from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.memory import free_bytes
 from torchpcct.validate import whole
 
-__all__ = ["available_bytes", "gram_bytes", "pwls_bytes", "require_memory", "resident_bytes"]
-
-# Arrays of one volume's size that live at once: statistic, volume, gradients, two steps with their
-# images, the prior's and the transform's temporaries, the spectra of a whole field.
 VOLUMES = 21
-# Arrays of the data's size besides the arguments: weighted data, projection, their product.
+"""Arrays of one volume's size that live at once: statistic, volume, gradients, two steps with their
+images, the prior's and the transform's temporaries, the spectra of a whole field."""
 SINOGRAMS = 3
+"""Arrays of the data's size besides the arguments: weighted data, projection, their product."""
 
 
 def available_bytes(device: torch.device) -> int:

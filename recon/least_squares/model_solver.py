@@ -10,10 +10,8 @@ from recon.conjugate_gradient import dot, per_volume
 from recon.data_term import NormalOperator
 from recon.least_squares.qggmrf import BoundPrior
 
-__all__ = ["ModelSolver", "line_search", "mean_share"]
-
-# Steps below this many units of rounding of the first one are noise.
 ROUNDING = 30.0
+"""Steps below this many units of rounding of the first one are noise."""
 # Iterations end when the preconditioned gradient norm has fallen by this factor, or after so many.
 REDUCTION = 3e-3
 MOST = 60

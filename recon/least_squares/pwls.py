@@ -42,16 +42,7 @@ from recon.result import Result
 from torchpcct.detector_window import footprint
 from torchpcct.validate import checked, number, whole
 
-__all__ = [
-    "Approach",
-    "MinimiseOptions",
-    "PwlsOptions",
-    "data_model",
-    "mean_weights",
-    "minimise",
-    "pwls",
-    "weigh",
-]
+__all__ = ["PwlsOptions", "minimise", "pwls"]
 
 
 class Approach:
@@ -126,22 +117,25 @@ class Approach:
 
 _LOG = logging.getLogger(__name__)
 
-# Relative error of the FFT model on the first step beyond which it no longer leads the iteration.
 MISFIT_LIMIT = 0.5
-# A model whose proposals do not halve in so many pairs has no place either.
+"""Relative error of the FFT model on the first step beyond which it no longer leads the
+iteration."""
 PATIENCE = 4
-# Largest ratio of two steps of the FFT model that is believed when what follows them is added up.
+"""A model whose proposals do not halve in so many pairs has no place either."""
 SLOWEST = 0.9
-# The gradient is followed by recurrence and measured afresh after so many pairs: rounding adds up.
+"""Largest ratio of two steps of the FFT model that is believed when what follows them is added
+up."""
 REFRESH = 25
-# Rounding does not fall with the gradient: after a start whose data gradient is so many times that
-# of 0, and where the FFT model sees nothing but rounding, it is measured afresh before the minimum
-# counts as reached.
+"""The gradient is followed by recurrence and measured afresh after so many pairs: rounding adds
+up."""
 FAR_START = 2.0
-# A grid that takes a larger share of the detector's columns is a whole field, not an inset.
+"""Rounding does not fall with the gradient: after a start whose data gradient is so many times that
+of 0, and where the FFT model sees nothing but rounding, it is measured afresh before the minimum
+counts as reached."""
 INSET_SHARE = 0.5
-# An FFT model that needs more is not built.
+"""A grid that takes a larger share of the detector's columns is a whole field, not an inset."""
 GRAM_BYTES = 2**29
+"""An FFT model that needs more is not built."""
 
 
 class MinimiseOptions(TypedDict, total=False):

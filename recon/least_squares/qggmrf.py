@@ -42,11 +42,11 @@ from torch import Tensor
 from torchpcct.threads import run
 from torchpcct.validate import number
 
-__all__ = ["DEFAULT_PRIOR", "QGGMRF", "BoundPrior", "quadratic"]
+__all__ = ["QGGMRF"]
 
-# Below p = 2 the curvature at 0 is infinite: gradients are rounded off at this fraction of the
-# threshold.
 ROUNDING = 1e-3
+"""Below p = 2 the curvature at 0 is infinite: gradients are rounded off at this fraction of the
+threshold."""
 
 
 @dataclass(frozen=True)

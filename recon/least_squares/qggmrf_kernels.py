@@ -17,11 +17,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-__all__ = ["along", "majorize"]
-
 _FLAGS = {"contract", "reassoc", "arcp", "nsz"}
-# Kernels that allocate nothing need no reference counts, which took a fifth of the time: one for
-# every row's slice.
 _VIEWS_ONLY: Any = {
     "nogil": True,
     "cache": True,
@@ -29,6 +25,8 @@ _VIEWS_ONLY: Any = {
     "error_model": "numpy",
     "_nrt": False,
 }
+"""Kernels that allocate nothing need no reference counts, which took a fifth of the time: one for
+every row's slice."""
 
 
 @njit(inline="always")

@@ -16,7 +16,7 @@ from torchpcct.scan import Scan
 from torchpcct.scan_memory import once
 from torchpcct.volume import in_words
 
-__all__ = ["TOLERANCE_HU", "reconstruct_pwls"]
+__all__ = ["reconstruct_pwls"]
 
 TOLERANCE_HU = 1.0
 """Root mean square distance to the minimum at which PWLS of a scan ends, unless another is asked

@@ -31,22 +31,21 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, VolumeGrid
 from torchpcct.projector import Projector
 
-__all__ = ["CELL_MM", "UnknownSurround", "length_unit"]
-
 # The scanner on which lengths were chosen, that of the paper: detector cell at the axis, radius of
 # the field of view, mm.
 CELL_MM = 0.35 * 626.0 / 1098.0
 FIELD_MM = 626.0 * math.sin(0.35 * 1500 / 2 / 1098.0)
-# Voxels of the whole field, and its detector cells at the axis, in mm: about 1 lp/mm. On other
-# scanners so many times as large as the field of view is, and not less than a cell.
 COARSE_MM = 0.6
-# The second FBP, which adds what the first does not explain, does with so much larger ones in the
-# plane: cupping and steps at the ends, no details.
+"""Voxels of the whole field, and its detector cells at the axis, in mm: about 1 lp/mm. On other
+scanners so many times as large as the field of view is, and not less than a cell."""
 SECOND = 2
-# Rows are joined to about this height at the axis, in mm, likewise: patients change slowly along z.
+"""The second FBP, which adds what the first does not explain, does with so much larger ones in the
+plane: cupping and steps at the ends, no details."""
 COARSE_ROW_MM = 1.5
-# Of a count: rounding of what it is computed from must not decide between two whole numbers.
+"""Rows are joined to about this height at the axis, in mm, likewise: patients change slowly along
+z."""
 TIE = 1e-9
+"""Of a count: rounding of what it is computed from must not decide between two whole numbers."""
 
 
 def length_unit(geometry: ConeBeam) -> float:

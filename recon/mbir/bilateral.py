@@ -26,9 +26,6 @@ from torch import Tensor
 from torchpcct.threads import run
 from torchpcct.validate import number, shaped, whole
 
-__all__ = ["joint_bilateral"]
-
-
 _LEAST = 1e-12
 """Of a threshold: its square is a float32 still."""
 

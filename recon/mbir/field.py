@@ -52,8 +52,6 @@ from torchpcct.volume import to_hu
 if TYPE_CHECKING:
     from torchpcct.metrics.residual_test import ResidualTest  # loads scipy.stats
 
-__all__ = ["Field", "FieldGram", "blockwise", "trained_grid"]
-
 VOXELS_PER_CELL = (0.7, 1.5)
 """Voxel over detector cell at the axis: the training has 0.2 mm voxels on cells of 0.2 mm × 0.29
 mm."""

@@ -8,13 +8,6 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-__all__ = [
-    "filtered",
-    "from_frequencies",
-    "squared_frequencies",
-    "to_frequencies",
-]
-
 
 def squared_frequencies(
     shape: Sequence[int], voxel_mm: float, like: Tensor | None = None

@@ -18,8 +18,6 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.scan_memory import once
 
-__all__ = ["Inset"]
-
 FARTHEST_CELL = 4.0
 """Detector cells at the axis may be so many times as large, or as small, as the network's
 voxels: clinical scanners."""

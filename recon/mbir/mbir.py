@@ -32,7 +32,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.switches import undisturbed
 from torchpcct.volume import in_words
 
-__all__ = ["Mbir", "average_onto", "overlap", "working_grid"]
+__all__ = ["Mbir"]
 
 _LOG = logging.getLogger(__name__)
 

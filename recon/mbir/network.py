@@ -34,14 +34,7 @@ from recon.mbir.bilateral import joint_bilateral
 from torchpcct.projector.operator import apply_linear
 from torchpcct.validate import number, whole
 
-__all__ = [
-    "GUIDE_VOXELS",
-    "REFERENCE_SCALE_HU",
-    "Network",
-    "NetworkConfig",
-    "bilateral_prior",
-    "edge_preserved",
-]
+__all__ = ["REFERENCE_SCALE_HU", "Network", "NetworkConfig", "bilateral_prior"]
 
 CONDITIONS = 3
 """Numbers that steer the gains: logarithm of the noise scale, fidelity, step."""

@@ -29,7 +29,7 @@ from recon.mbir.network import REFERENCE_SCALE_HU, Network, NetworkConfig, bilat
 from recon.names import check_prior, filter_name, is_module_name, loaded
 from torchpcct.validate import number
 
-__all__ = ["PlugAndPlay", "Prior", "name_of", "network_of", "prior_of", "same_kind"]
+__all__ = ["PlugAndPlay", "Prior"]
 
 Prior = Callable[..., Tensor]
 """A :class:`recon.mbir.network.Network`, or a module or function with the arguments of its

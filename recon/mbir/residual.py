@@ -28,8 +28,6 @@ from torch.nn import functional as F
 from recon.data_term import Quadratic
 from recon.mbir.frequencies import filtered, from_frequencies
 
-__all__ = ["significant_residual"]
-
 _BLOCK = 16
 _STEP = 4
 """Edge of a block and distance of neighbours in voxels: at 0.2 mm 3.2 mm, some periods of the

@@ -48,19 +48,7 @@ from recon.mbir.residual import significant_residual
 from torchpcct.switches import undisturbed
 from torchpcct.validate import number, whole
 
-__all__ = [
-    "DEFAULT_FIDELITY",
-    "REFERENCE_SCALE_HU",
-    "Unrolled",
-    "Views",
-    "bound",
-    "fidelity_frequency",
-    "first_views",
-    "guide_noise",
-    "limited",
-    "low_residual",
-    "start",
-]
+__all__ = ["Unrolled"]
 
 Views = tuple[Tensor, Tensor, Tensor | None]
 DEFAULT_FIDELITY = 0.5

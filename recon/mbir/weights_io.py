@@ -17,8 +17,6 @@ from torch import Tensor
 
 from torchpcct.files import atomic_write
 
-__all__ = ["TensorFileError", "digest", "read_tensors", "write_tensors"]
-
 _HEADER = {"format", "sha256", "metadata", "sha256_of_metadata"}
 
 

@@ -41,8 +41,6 @@ from torchpcct.scene.phantoms.thorax import thorax
 from torchpcct.validate import choice, number, numbers
 from torchpcct.volume import to_hu
 
-__all__ = ["Settings", "checks", "figures", "measure"]
-
 Floats = NDArray[np.float64]
 
 BOWTIES = ("large", "large+roi")

@@ -30,8 +30,6 @@ from torchpcct.scanner import presets
 from torchpcct.validate import numbers
 from torchpcct.viz import Panel, panels
 
-__all__ = ["SCREEN", "Settings", "dose_chart", "figures", "measure"]
-
 SCREEN = "compare_screen"
 """Template of what a terminal shows: the answer, the dose factors of every method, and where the
 rest is."""

@@ -26,8 +26,6 @@ from torchpcct.scanner.silicon_transport import Stack, efficiency, follow
 from torchpcct.scene.materials import PLAQUE_MATERIALS, material
 from torchpcct.validate import numbers
 
-__all__ = ["Settings", "checks", "figures", "measure"]
-
 Floats = NDArray[np.float64]
 
 PUBLISHED_DQE = 0.68

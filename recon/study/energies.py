@@ -37,8 +37,6 @@ from torchpcct.spectral import (
     weighting_gain,
 )
 
-__all__ = ["PAIRS", "VIEWS", "energy_rows"]
-
 PAIRS = (("lumen", "fibrous"), ("fibrous", "patient"), ("core", "fibrous"))
 """Bodies of the plaque scene whose contrasts are looked at."""
 

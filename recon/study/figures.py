@@ -12,8 +12,6 @@ from torchpcct.metrics.placement import RoiPair
 from torchpcct.metrics.roi import PROTOCOL_PIXEL_MM
 from torchpcct.viz import Panel
 
-__all__ = ["curve_axes", "extent", "middle_panel", "plaque_panel", "roi_outlines"]
-
 _SHOWN_PX = 160
 """Edge of the middle of an image of the protocol's pixels that shows the vessel and its
 surroundings."""

@@ -52,8 +52,6 @@ from torchpcct.scene.plaque import Plaque, plaque_scene
 from torchpcct.validate import number
 from torchpcct.viz import WINDOW_HU, Panel, panels
 
-__all__ = ["Settings", "checks", "figures", "measure"]
-
 METHODS = {"fbp": "FBP", "pwls": "q-GGMRF PWLS", "mbir": "MBIR (learned prior)"}
 """Methods and their names in tables."""
 

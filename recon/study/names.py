@@ -12,8 +12,6 @@ from pathlib import Path
 
 from torchpcct.validate import choice, meant
 
-__all__ = ["case_names", "check_case", "check_setting", "setting_names"]
-
 _HERE = Path(__file__).parent
 """Folder of the studies."""
 _TABLES = {"_PLAQUE": "", "_BODY": "body-", "_CONE": "cone-"}

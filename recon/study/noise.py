@@ -48,8 +48,6 @@ from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene
 from torchpcct.viz import Panel, panels
 
-__all__ = ["Settings", "checks", "figures", "measure"]
-
 Floats = NDArray[np.float64]
 
 _BLOCK = 40

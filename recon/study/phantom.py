@@ -25,8 +25,6 @@ from torchpcct.scene.plaque import PATIENT_DIAMETER, Plaque, plaque_scene
 from torchpcct.validate import number, numbers
 from torchpcct.viz import Panel, panels
 
-__all__ = ["Settings", "checks", "figures", "measure"]
-
 TRANSMITTED = "100 kVp behind 24 cm fat"
 """Spectrum behind the patient for which CT numbers are checked."""
 MIDDLE = "64 keV"

@@ -26,8 +26,6 @@ from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene
 from torchpcct.validate import number, numbers
 
-__all__ = ["Settings", "figures", "measure"]
-
 _EDGE_MM = 9.2
 """Of the inset about the plaque, seen in every view."""
 

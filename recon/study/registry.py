@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from recon.study.report import Report
     from recon.study.study import Measured, Progress
 
-__all__ = ["STUDIES", "build_settings", "folder", "measured", "part", "report_of", "run"]
-
 STUDIES: dict[str, str] = {
     "compare": (
         "what dose MBIR saves at the paper's plaque, beside FBP, PWLS and the best simple filter"

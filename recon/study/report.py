@@ -22,8 +22,6 @@ import numpy as np
 
 from recon.evaluate.report import filled, write_report
 
-__all__ = ["TEMPLATES", "Check", "Report", "aligned", "around", "render"]
-
 TEMPLATES = Path(__file__).parent / "templates"
 """Of the studies' texts."""
 

@@ -55,8 +55,6 @@ from torchpcct.scene.plaque import PATIENT_DIAMETER, Plaque, plaque_scene
 from torchpcct.validate import number
 from torchpcct.viz import panels
 
-__all__ = ["Settings", "checks", "figures", "measure"]
-
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 """Full width at half maximum of a Gaussian of unit standard deviation."""
 _PX_FWHM = FWHM_PER_SIGMA * PROTOCOL_PIXEL_MM

@@ -20,8 +20,6 @@ from typing import Any
 from recon.evaluate.report import filled
 from recon.study import registry, report
 
-__all__ = ["README_MARKS", "differences", "render"]
-
 README_MARKS = ("<!-- results: rendered by torchpcct verify --write -->", "<!-- end of results -->")
 """Between them stands in README.md, and in the template, what both share."""
 

@@ -32,16 +32,6 @@ import numpy as np
 import torchpcct
 from torchpcct.validate import whole
 
-__all__ = [
-    "Measured",
-    "Progress",
-    "ProgressBars",
-    "StudySettings",
-    "Timed",
-    "environment",
-    "silent",
-]
-
 Progress = Callable[[str, float], None]
 """Called with the name of a step (after a bar, ``|``, what changes in the meantime) and its
 finished fraction, 0…1."""

@@ -21,8 +21,6 @@ from scipy.spatial import cKDTree
 
 from torchpcct.geometry import VolumeGrid
 
-__all__ = ["Centreline", "Coordinates", "follow", "sections", "smooth_line"]
-
 Floats = NDArray[np.float64]
 
 _STEP_MM = 0.4

@@ -23,8 +23,6 @@ from recon.vessel.model import EXCESS, Fit, VesselModel
 from torchpcct.threads import run
 from torchpcct.validate import shaped
 
-__all__ = ["CorePrior", "CoreSpace", "Evidence"]
-
 Floats = NDArray[np.float64]
 
 CENTRE = slice(0, 3)

@@ -16,8 +16,6 @@ from recon.conjugate_gradient import conjugate_gradient
 from recon.data_term import Quadratic
 from torchpcct.geometry import VolumeGrid
 
-__all__ = ["grid_of", "in_hu", "least_squares", "pilot", "scores"]
-
 Floats = NDArray[np.float64]
 
 _PILOT_SD_MM = 0.25

@@ -14,8 +14,6 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import RoiMean
 from torchpcct.scan import Scan
 
-__all__ = ["fbp_deviations"]
-
 
 def fbp_deviations(scan: Scan, grid: VolumeGrid, regions: Mapping[str, Any]) -> dict[str, float]:
     """Standard deviation in HU of soft FBP's mean over each region, and of the contrast, of the

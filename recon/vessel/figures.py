@@ -13,7 +13,7 @@ from recon.vessel.core import AXES, CAP, CENTRE, CoreSpace
 from recon.vessel.model import FAT, FIBROUS, LUMEN, THICKNESS, WALL, Fit, VesselModel
 from recon.vessel.quality import ResidualTexture
 
-__all__ = ["TissueEstimate", "draws_of", "estimate"]
+__all__ = ["TissueEstimate"]
 
 Floats = NDArray[np.float64]
 

@@ -8,15 +8,6 @@ import math
 import numpy as np
 from numba import njit
 
-__all__ = [
-    "core_fractions",
-    "gather_block",
-    "outline_radius",
-    "outline_spread",
-    "sharpened",
-    "symmetric_step",
-]
-
 
 @njit(cache=True)
 def sharpened(values, neighbours, excess, out):

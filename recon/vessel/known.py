@@ -56,8 +56,6 @@ from recon.vessel.reading import read_plaque
 from recon.vessel.start import find_vessel
 from torchpcct.validate import numbers
 
-__all__ = ["KnownTissues", "KnownVessel", "known_vessel"]
-
 _SHIFT_HU = 200.0
 """HU; where the zero lies does not matter to an image: 150 HU added to everything change it by 1 HU
 rms instead of 9."""

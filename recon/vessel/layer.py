@@ -28,8 +28,6 @@ from torch import Tensor
 from recon.conjugate_gradient import conjugate_gradient
 from recon.vessel.model import FAT, Fit, VesselModel
 
-__all__ = ["LENGTHS_MM", "SD_HU", "LayerEstimate", "LayerField"]
-
 Floats = NDArray[Any]
 
 SD_HU = 100.0

@@ -17,8 +17,6 @@ from recon.vessel.kernels import gather_block, symmetric_step
 from torchpcct.threads import run
 from torchpcct.validate import shaped
 
-__all__ = ["LocalGram"]
-
 Floats = NDArray[np.floating[Any]]
 
 LARGEST = 1_500_000_000

@@ -34,8 +34,6 @@ from recon.vessel.local_gram import LocalGram
 from recon.vessel.outline import Outline, OutlineAt
 from recon.vessel.prior import VesselPrior
 
-__all__ = ["FAT", "FIBROUS", "LUMEN", "THICKNESS", "WALL", "Drawing", "Fit", "Start", "VesselModel"]
-
 Floats = NDArray[np.float64]
 
 FAT = 0

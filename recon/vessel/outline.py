@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from recon.vessel.centreline import Coordinates
 from recon.vessel.kernels import outline_radius, outline_spread
 
-__all__ = ["Outline", "OutlineAt"]
-
 Floats = NDArray[np.float64]
 
 _KNOT_MM = 0.9

@@ -13,8 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Cloud", "Target", "lead"]
-
 Floats = NDArray[np.float64]
 
 Target = Callable[[Floats], tuple[Floats, Floats]]

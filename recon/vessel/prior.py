@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torchpcct.validate import number, numbers, whole
 
-__all__ = ["MOST_ORDERS", "VesselPrior"]
+__all__ = ["VesselPrior"]
 
 MOST_ORDERS = 4
 """Fourier orders of a section: 1 moves it, 2 makes it an ellipse, 3 an egg; a flat ellipse needs

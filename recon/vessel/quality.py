@@ -20,8 +20,6 @@ from recon.vessel.data import least_squares, pilot
 from recon.vessel.data import scores as scores_in
 from recon.vessel.model import FAT, FIBROUS, Fit, VesselModel
 
-__all__ = ["Leftover", "ResidualTexture", "beside", "leftover", "misfit", "scores_of", "texture"]
-
 Floats = NDArray[np.float64]
 
 LENGTH_MM = 0.3

@@ -25,7 +25,7 @@ from recon.vessel.start import find_vessel
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import checked, number, numbers, whole
 
-__all__ = ["CERTAIN", "PlaqueReading", "core_regions", "read_plaque", "read_regions"]
+__all__ = ["PlaqueReading", "read_plaque"]
 
 Floats = NDArray[np.float64]
 

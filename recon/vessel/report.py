@@ -16,8 +16,6 @@ from torchpcct.files import atomic_write
 from torchpcct.viz import Panel, panels
 from torchpcct.volume import Volume
 
-__all__ = ["picture", "save", "table"]
-
 _COLOURS = {
     "lumen": "tab:red",
     "fibrous": "tab:orange",

@@ -12,8 +12,6 @@ from recon.vessel.centreline import Centreline, follow, sections, smooth_line
 from recon.vessel.model import Start
 from torchpcct.geometry import VolumeGrid
 
-__all__ = ["find_vessel", "require_within"]
-
 Floats = NDArray[np.float64]
 
 _BALLS_MM = (1.8, 0.9)

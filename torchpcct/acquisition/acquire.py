@@ -29,7 +29,7 @@ from torchpcct.scene.scene import Scene
 from torchpcct.scene.voxels import VoxelScene
 from torchpcct.validate import checked, whole
 
-__all__ = ["acquire", "acquire_voxels", "detected", "plan", "readings_key", "signal_spectra"]
+__all__ = ["acquire", "acquire_voxels"]
 
 _TOLERANCE = 1e-5
 """Error of a line integral over a metre of body by the number of basis maps."""

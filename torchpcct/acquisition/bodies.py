@@ -14,12 +14,10 @@ from torchpcct.geometry import ConeBeam, view_step
 from torchpcct.scene.chords import pack
 from torchpcct.scene.scene import Scene
 
-__all__ = ["Bodies", "BodySet"]
-
 Floats = NDArray[np.float64]
 
-# Where an endless body is cut for the bookkeeping of windows: far beyond any scanner.
 _ENDLESS_MM = 1e5
+"""Where an endless body is cut for the bookkeeping of windows: far beyond any scanner."""
 
 
 class BodySet(NamedTuple):

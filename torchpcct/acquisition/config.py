@@ -21,7 +21,7 @@ from torchpcct.scene.voxels import DENSE, VoxelScene
 from torchpcct.validate import choice, number
 from torchpcct.volume import Volume
 
-__all__ = ["EXAMPLE", "SimulationConfig", "configured", "grid_of", "read_config"]
+__all__ = ["SimulationConfig", "configured", "read_config"]
 
 EXAMPLE = """\
 # A simulated scan: torchpcct simulate --config scene.yaml --out scan.h5

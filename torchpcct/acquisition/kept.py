@@ -25,7 +25,7 @@ from torch import Tensor
 
 from torchpcct.cache_folder import private_folder
 
-__all__ = ["MOST_BYTES", "KnownReadings", "ReadingsFolder", "fingerprint", "forget_readings"]
+__all__ = ["forget_readings"]
 
 MOST_BYTES = 2**28
 """Of the readings held in memory, of all scenes together; the folder holds twice as many."""

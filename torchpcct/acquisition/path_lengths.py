@@ -23,8 +23,6 @@ from torchpcct.geometry import ConeBeam
 from torchpcct.scene.chords import pack
 from torchpcct.scene.scene import Scene
 
-__all__ = ["tissue_path_lengths"]
-
 _MU = 1e-4
 """mm⁻¹ of the medium whose readings tell its path: so thin that they are computed to second
 order everywhere."""

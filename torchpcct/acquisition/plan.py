@@ -25,7 +25,7 @@ from torchpcct.geometry import ConeBeam, VolumeGrid
 from torchpcct.scanner.scanner import Scanner
 from torchpcct.validate import number
 
-__all__ = ["Effect", "Plan", "make_plan"]
+__all__ = ["Plan", "make_plan"]
 
 _PROBE_VIEWS = 6
 _PROBE_ROWS = 3
@@ -33,9 +33,9 @@ _PROBE_ROWS = 3
 # reproduce.
 _EFFECT_SUB_RAYS = 32
 _TARGET_SUB_RAYS = 256
-# Rms error of the line integrals by the finite number of sub-rays, relative to the inset's highest
-# one.
 _PEAK_ERROR = 1e-3
+"""Rms error of the line integrals by the finite number of sub-rays, relative to the inset's highest
+one."""
 
 _LEFT_OUT = (
     (

@@ -39,8 +39,6 @@ from torchpcct.scanner.source import Slabs, Source
 from torchpcct.scene.materials import material
 from torchpcct.validate import choice, number, reals
 
-__all__ = ["scanner_of"]
-
 _KEYS = ("name", "geometry", "source", "detector", "filters", "bowtie", "energy_bin_kev")
 _DETECTORS = {"silicon": SiliconDetector, "scintillator": Scintillator}
 _BOWTIE = ("material", "fan_angles_deg", "thickness_mm")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S
 from torchpcct.scanner.scanner import Scanner
 
-__all__ = ["Nodes", "energy_nodes", "signal_spectra"]
+__all__ = ["energy_nodes", "signal_spectra"]
 
 Floats = NDArray[np.float64]
 

@@ -39,8 +39,6 @@ from torchpcct.scene.chords import PARAMETERS
 from torchpcct.threads import run
 from torchpcct.validate import shaped
 
-__all__ = ["SUB_RAY_COUNTS", "Beam", "compress", "expected_readings", "sub_rays"]
-
 Floats = NDArray[np.float64]
 
 
@@ -68,8 +66,9 @@ LARGE_VARIANCE = 0.01
 """Variance of a line integral inside a cell beyond which the mean to second order gives way to the
 full sum (the third cumulant reaches 1e-4)."""
 
-# Plastic-number sequence (Roberts 2018): two coordinates that fill the square evenly at any length.
 _PLASTIC = 1.0 / 1.32471795724474602596
+"""Plastic-number sequence (Roberts 2018): two coordinates that fill the square evenly at any
+length."""
 
 
 def sub_rays(count: int, active: Sequence[bool] = (True,) * 5) -> Floats:

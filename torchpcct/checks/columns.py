@@ -27,7 +27,7 @@ from torchpcct.geometry import Geometry
 from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.validate import checked
 
-__all__ = ["GAIN_TOLERANCE", "column_test"]
+__all__ = ["column_test"]
 
 Floats = NDArray[np.float64]
 

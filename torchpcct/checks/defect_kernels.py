@@ -8,8 +8,6 @@ import math
 import numpy as np
 from numba import njit
 
-__all__ = ["bends", "levels"]
-
 
 @njit(nogil=True, cache=True)
 def levels(begin, end, counts, first, views, seen, dark, bright):

@@ -24,18 +24,7 @@ from torchpcct.scan import Scan
 from torchpcct.threads import run
 from torchpcct.validate import shaped
 
-__all__ = [
-    "Cells",
-    "Defects",
-    "cell_sums",
-    "dark_views",
-    "dead_readings",
-    "find_defects",
-    "is_repaired",
-    "photon_and_light",
-    "repair_defects",
-    "wrong_cells",
-]
+__all__ = ["Defects", "dead_readings", "find_defects", "repair_defects"]
 
 BRIGHT = 30.0
 """Expected readings from which 0 cannot be noise (probability 1e-13)."""

@@ -33,7 +33,7 @@ from torchpcct.checks.orbit_plane import THIN, lack_of_cells, orbit_plane
 from torchpcct.checks.scan_test import UNKNOWN, ScanTest, check_lines
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
 
-__all__ = ["STEP_TOLERANCE", "WEIGHT_TOLERANCE", "moment_test"]
+__all__ = ["moment_test"]
 
 WEIGHT_TOLERANCE = 0.002
 """Root mean square of the sum's relative change with the direction that is no finding: 0.3 % of a

@@ -54,14 +54,7 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, view_step
 from torchpcct.validate import checked
 
-__all__ = [
-    "CENTRE_TOLERANCE",
-    "FALSE_ALARMS",
-    "SCALE_TOLERANCE",
-    "STEP_TOLERANCE",
-    "centre_test",
-    "geometry_test",
-]
+__all__ = ["centre_test", "geometry_test"]
 
 CENTRE_TOLERANCE = 0.1
 """Error of the centre in columns that is no finding: alignment, and what interpolation between

@@ -26,8 +26,6 @@ from torch import Tensor
 
 from torchpcct.geometry import ConeBeam
 
-__all__ = ["PARTED", "THIN", "OrbitPlane", "lack_of_cells", "orbit_plane", "shared_square"]
-
 _FLAT_CELLS = 1.0
 """Rows whose opposite rays part by more than so many of them at the border of the field are not
 averaged."""

@@ -22,12 +22,10 @@ from torchpcct.checks.scan_test import check_lines
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry, view_step
 
-__all__ = ["BLOCKS", "OppositeRays", "Pattern", "RayPairs", "product", "unwrapped"]
-
 BLOCKS = 24
 """Parts of the views whose scatter tells the error of a sum."""
-# Readings whose opposites are looked up; more only cost time.
 _MOST = 500_000
+"""Readings whose opposites are looked up; more only cost time."""
 # Views beside an opposite angle that are farther apart than so many usual steps do not stand for
 # it.
 _GAP_STEPS = 3.0

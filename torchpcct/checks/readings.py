@@ -20,7 +20,7 @@ from torch import Tensor
 from torchpcct.readings import DIM, FEWEST, MEDIAN_TO_SD, smoothed
 from torchpcct.scan import Scan
 
-__all__ = ["reading_warnings", "without_light"]
+__all__ = ["reading_warnings"]
 
 AIR_TOLERANCE = 0.015
 """Line integral of air below which the beam, or its calibration, is not that of the scan; 0.5 HU

@@ -30,7 +30,7 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry, view_step
 from torchpcct.readings import MEDIAN_TO_SD
 
-__all__ = ["RotationAxis", "at_axis", "axis_column", "rotation_axis"]
+__all__ = ["RotationAxis", "axis_column", "rotation_axis"]
 
 LEAST = 0.02
 LEAST_HALF = 0.05

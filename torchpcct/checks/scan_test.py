@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["UNKNOWN", "ScanTest", "check_lines"]
+__all__ = ["ScanTest"]
 
 
 @dataclass(frozen=True)

@@ -25,13 +25,7 @@ from torchpcct.scanner.filters import behind_filters
 from torchpcct.scene.materials import Material
 from torchpcct.validate import checked, number
 
-__all__ = [
-    "MGY_PER_KEV_PER_G",
-    "air_fluence",
-    "fan_half_angle",
-    "mass_energy_absorption",
-    "mass_interaction",
-]
+__all__ = ["air_fluence", "mass_energy_absorption"]
 
 Floats = NDArray[np.float64]
 

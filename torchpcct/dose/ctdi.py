@@ -23,7 +23,7 @@ from torchpcct.scene import Scene
 from torchpcct.scene.phantoms.quality import CTDI_HOLES, ctdi
 from torchpcct.validate import checked
 
-__all__ = ["CtdiDose", "ctdi_dose", "disc_samples"]
+__all__ = ["CtdiDose", "ctdi_dose"]
 
 Floats = NDArray[np.float64]
 

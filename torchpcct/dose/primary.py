@@ -30,13 +30,14 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.kernel_cache import forget_outdated
 from torchpcct.scanner import Scanner
 from torchpcct.scene import Scene
-from torchpcct.scene.chords import interval, pack
+from torchpcct.scene.chord_kernels import interval
+from torchpcct.scene.chords import pack
 from torchpcct.scene.materials import material
 from torchpcct.scene.scene import voxel_centres
 from torchpcct.threads import run
 from torchpcct.validate import checked, choice, number, whole
 
-__all__ = ["QUANTITIES", "primary_dose", "slice_points"]
+__all__ = ["primary_dose"]
 
 Floats = NDArray[np.float64]
 

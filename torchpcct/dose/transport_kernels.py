@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 
     from torchpcct.typing import Floats, Ints
 
-
-__all__ = ["BATCHES", "transport"]
-
 BATCHES = 16
 
 _KEV_ANGSTROM = 12.398419843

@@ -14,8 +14,6 @@ from torchpcct.formats.file_names import matching
 from torchpcct.formats.hdf5 import inside
 from torchpcct.validate import choice
 
-__all__ = ["given_array", "read_array", "read_mat"]
-
 _HDF5_AT = 512
 """Where the HDF5 of a MATLAB file of version 7.3 begins."""
 _OF_NUMBERS = (

@@ -18,18 +18,6 @@ import numpy as np
 from torchpcct.files import require_ordinary
 from torchpcct.memory import free_bytes
 
-__all__ = [
-    "MOST_READINGS",
-    "check_expansion",
-    "check_size",
-    "needed",
-    "read_numbers",
-    "read_text",
-    "read_yaml",
-    "reading",
-    "yaml_values",
-]
-
 MOST_READINGS = 2**36
 """Headers that promise more numbers than this are damaged; nothing is allocated for them."""
 

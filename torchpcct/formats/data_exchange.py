@@ -26,7 +26,7 @@ from torchpcct.readings import TRANSFER_FRAMES
 from torchpcct.scan import Scan
 from torchpcct.validate import number
 
-__all__ = ["Frames", "angles_in", "given_frames", "length_in", "read_data_exchange"]
+__all__ = ["read_data_exchange"]
 
 _PIXEL = (
     "measurement/instrument/detector/pixel_size",

@@ -26,7 +26,7 @@ from torchpcct.geometry import ConeBeam
 from torchpcct.scan import Scan
 from torchpcct.validate import whole
 
-__all__ = ["ClinicalProjections", "holds_projections", "read_dicom_ct_pd"]
+__all__ = ["read_dicom_ct_pd"]
 
 _TAGS = {
     "spacing": 0x70291002,

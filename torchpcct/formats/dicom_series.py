@@ -19,15 +19,6 @@ from torchpcct.formats.damage import check_expansion, needed, reading
 from torchpcct.formats.volume_grid import STRAIGHT, grid_from
 from torchpcct.geometry import VolumeGrid
 
-__all__ = [
-    "DICOM_ENDINGS",
-    "check_series",
-    "dicom_files",
-    "open_dicom",
-    "read_dicom",
-    "write_dicom",
-]
-
 _LOG = logging.getLogger(__name__)
 
 DICOM_ENDINGS = (".dcm", ".ima")

@@ -10,8 +10,6 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-__all__ = ["in_number_order", "matching"]
-
 _WHOLE = re.compile(r"\d+")
 """Whole numbers in a name."""
 _DECIMAL = re.compile(r"(?:(?<![0-9A-Za-z])-)?\d+(?:\.\d+)?")

@@ -52,8 +52,6 @@ from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
 from torchpcct.validate import choice, number, reals, whole
 from torchpcct.vector_geometry import VectorGeometry, helical_motion
 
-__all__ = ["angles_of", "geometry_of", "geometry_values"]
-
 _OWN = {
     "parallel": {"columns", "pitch", "offset"},
     "fan": {"sod", "sdd", "columns", "pitch", "offset", "detector"},

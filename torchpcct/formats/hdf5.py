@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["inside", "require_inside"]
-
 _MOST_LINKS = 16
 """Soft links to soft links; deeper ones lead in a circle."""
 _DEEPEST = 16

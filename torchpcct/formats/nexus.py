@@ -21,7 +21,7 @@ from torchpcct.formats.lengths import unit_text
 from torchpcct.scan import Scan
 from torchpcct.validate import choice
 
-__all__ = ["holds_nexus", "read_nexus"]
+__all__ = ["read_nexus"]
 
 _PROJECTION = 0
 """NXtomo's image key of a projection."""

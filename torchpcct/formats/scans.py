@@ -28,7 +28,7 @@ from torchpcct.scan_file import slice_axis, sliced
 from torchpcct.validate import number
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["adapted", "check_scan_name", "open_scan", "own_options"]
+__all__ = ["adapted", "open_scan"]
 
 
 class _Reader(NamedTuple):

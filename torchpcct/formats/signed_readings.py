@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["unwrapped"]
-
 
 def unwrapped(arrays: Mapping[str, Any], what: str) -> dict[str, Any]:
     """Readings of a scan, those that were stored as signed integers though a detector counts from 0

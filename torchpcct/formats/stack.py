@@ -20,7 +20,7 @@ from torchpcct.scan_file import slice_axis, sliced
 from torchpcct.validate import choice
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["EXAMPLE", "read_stack"]
+__all__ = ["read_stack"]
 
 EXAMPLE = """\
 # A stack of projections: torchpcct reconstruct scan.yaml; files are looked for beside this one

@@ -34,18 +34,7 @@ from torchpcct.formats.volume_grid import STRAIGHT, grid_from
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import UNITS
 
-__all__ = [
-    "ENDINGS",
-    "check_target",
-    "check_volume_name",
-    "format_of",
-    "is_own_volume",
-    "nifti_header",
-    "read_meta_image",
-    "read_nifti",
-    "write_meta_image",
-    "write_nifti",
-]
+__all__ = ["check_volume_name"]
 
 ENDINGS = {
     "NIfTI": (".nii", ".nii.gz"),

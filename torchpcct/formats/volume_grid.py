@@ -8,8 +8,6 @@ import numpy as np
 
 from torchpcct.geometry import VolumeGrid
 
-__all__ = ["STRAIGHT", "grid_from"]
-
 STRAIGHT = 1e-4
 """Relative deviation of axes from those of the scanner that is none."""
 

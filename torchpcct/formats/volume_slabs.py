@@ -29,8 +29,6 @@ from torchpcct.formats.volume_files import nifti_header
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import UNITS
 
-__all__ = ["SLAB_ENDINGS", "SlabFile", "check_slab_name", "read_ome_zarr", "write_ome_zarr"]
-
 SLAB_ENDINGS = (".nii", ".zarr")
 """Endings of files that are written slab by slab."""
 CHUNK = 32

@@ -16,7 +16,7 @@ from torchpcct.metrics.resolution import first_below
 from torchpcct.scan import Scan
 from torchpcct.validate import checked
 
-__all__ = ["HalfSplit", "half_split", "halves"]
+__all__ = ["HalfSplit", "half_split"]
 
 Floats = NDArray[np.float64]
 _AGREE = 0.143

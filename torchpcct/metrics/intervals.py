@@ -20,16 +20,7 @@ from scipy.special import ndtr, ndtri
 
 from torchpcct.validate import checked, coverage, whole
 
-__all__ = [
-    "Estimate",
-    "Jackknifed",
-    "bca_interval",
-    "combined",
-    "generator",
-    "leave_one_out",
-    "log_of_sum",
-    "resampling",
-]
+__all__ = ["Estimate", "Jackknifed", "combined"]
 
 Floats = NDArray[np.float64]
 

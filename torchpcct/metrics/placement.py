@@ -21,7 +21,7 @@ from torchpcct.metrics.roi import RoiMean
 from torchpcct.scene import Scene
 from torchpcct.validate import checked
 
-__all__ = ["RoiPair", "RoiRule", "place_rois", "whole_rois"]
+__all__ = ["RoiPair", "RoiRule", "place_rois"]
 
 
 @dataclass(frozen=True)

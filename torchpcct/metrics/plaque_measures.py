@@ -36,16 +36,7 @@ from torchpcct.metrics.resolution import first_below
 from torchpcct.metrics.roi import as_array
 from torchpcct.validate import checked
 
-__all__ = [
-    "CORE_HU",
-    "LUMEN_HU",
-    "PlaqueSegmentation",
-    "basin_depth",
-    "cap_on_line",
-    "dice",
-    "lumen_area",
-    "segment_plaque",
-]
+__all__ = ["PlaqueSegmentation", "dice", "lumen_area", "segment_plaque"]
 
 LUMEN_HU = 250.0
 """Threshold of the lumen in HU (Li et al.)."""
@@ -59,9 +50,9 @@ _STEP_MM = 0.005
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
-# Dark regions join at edges only, bright ones at corners too: a closed diagonal line of cap
-# separates.
 _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], dtype=bool)
+"""Dark regions join at edges only, bright ones at corners too: a closed diagonal line of cap
+separates."""
 
 
 @checked

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from torch import Tensor
 
-__all__ = ["recovered_contrast"]
-
 _BODY = 0.5
 """Voxels that the feature changes by more than this share of what it changes at most are its own;
 the others are its edge."""

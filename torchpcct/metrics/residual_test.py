@@ -30,7 +30,7 @@ from torch import Tensor
 
 from torchpcct.validate import checked, coverage, number
 
-__all__ = ["FALSE_ALARMS", "ResidualTest", "residual_test"]
+__all__ = ["ResidualTest", "residual_test"]
 
 FALSE_ALARMS = 0.005
 """Share of faultless scans for which any of the tests raises an alarm."""

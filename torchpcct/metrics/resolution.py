@@ -19,12 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from torchpcct.metrics.roi import as_array
 from torchpcct.validate import checked
 
-__all__ = [
-    "TransferFunction",
-    "edge_profile",
-    "first_below",
-    "task_transfer",
-]
+__all__ = ["TransferFunction", "edge_profile", "task_transfer"]
 
 Floats = NDArray[np.float64]
 

@@ -18,14 +18,7 @@ from torch import Tensor
 
 from torchpcct.geometry import VolumeGrid
 
-__all__ = [
-    "PROTOCOL_PIXELS",
-    "PROTOCOL_PIXEL_MM",
-    "RoiMean",
-    "as_array",
-    "axial_grid",
-    "sample_axial",
-]
+__all__ = ["RoiMean"]
 
 PROTOCOL_PIXEL_MM = 0.035
 PROTOCOL_PIXELS = 256

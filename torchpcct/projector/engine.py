@@ -20,8 +20,6 @@ from torchpcct.kernel_cache import announce_compilation
 from torchpcct.projector.cuda import passes as cuda
 from torchpcct.projector.tables import Tables, VectorTables
 
-__all__ = ["ENGINES", "Engine"]
-
 _TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-10}
 """Relative error up to which a device's kernels agree with the CPU's."""
 _CHECKED: dict[tuple[str, torch.dtype], bool] = {}

@@ -24,7 +24,7 @@ from torchpcct.vector_geometry import VectorGeometry
 if TYPE_CHECKING:
     from scipy.sparse.linalg import LinearOperator
 
-__all__ = ["Operator", "Projector", "apply_linear"]
+__all__ = ["Operator", "Projector"]
 
 Linear = Callable[[Tensor], Tensor]
 _DTYPES = (torch.float32, torch.float64)

@@ -24,8 +24,6 @@ from torchpcct.projector.rays import check_pair, check_source
 from torchpcct.switches import unswitched
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["PosedEngine"]
-
 
 class PosedEngine:
     """Forward and adjoint passes of a scan whose poses follow tensors; what they are is read at

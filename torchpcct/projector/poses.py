@@ -20,7 +20,7 @@ from torchpcct.geometry import Geometry, ParallelBeam
 from torchpcct.validate import checked, choice
 from torchpcct.vector_geometry import VectorGeometry
 
-__all__ = ["PARAMETERS", "ParametricGeometry", "moved_poses", "windowed_poses", "with_parameters"]
+__all__ = ["PARAMETERS", "ParametricGeometry", "with_parameters"]
 
 PARAMETERS: Mapping[str, str] = {
     "offset": "mm",

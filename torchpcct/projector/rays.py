@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, ParallelBeam, VolumeGrid, beam
 
-__all__ = ["Rays", "Segments", "check_pair", "check_source", "rays_of", "slab_lattice", "split"]
-
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 

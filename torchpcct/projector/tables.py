@@ -23,10 +23,8 @@ from torchpcct.projector.rays import (
 )
 from torchpcct.vector_geometry import VectorGeometry, split_motion
 
-__all__ = ["Tables", "VectorTables", "layer_spacing"]
-
-# Row edges may move by this part of the blur between two depth layers (see layer_spacing).
 LAYER_SHIFT = 0.04
+"""Row edges may move by this part of the blur between two depth layers (see layer_spacing)."""
 
 
 class Tables:

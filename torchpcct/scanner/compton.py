@@ -9,8 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from torchpcct.validate import checked
 
-__all__ = ["ELECTRON_REST_KEV", "mean_recoil_fraction", "recoil"]
-
 Floats = NDArray[np.float64]
 
 ELECTRON_REST_KEV = 510.99895

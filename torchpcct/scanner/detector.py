@@ -23,7 +23,7 @@ from torchpcct.scanner.compton import recoil
 from torchpcct.scene.materials import MATERIALS, Material
 from torchpcct.validate import choice, number, numbers, whole
 
-__all__ = ["SILICON_THRESHOLDS_KEV", "Detector", "Scintillator", "SiliconDetector"]
+__all__ = ["Detector", "Scintillator", "SiliconDetector"]
 
 Floats = NDArray[np.float64]
 

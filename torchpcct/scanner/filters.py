@@ -16,7 +16,7 @@ from torchpcct.scanner.source import Slabs
 from torchpcct.scene.materials import MATERIALS, Material
 from torchpcct.validate import checked, number, numbers
 
-__all__ = ["Bowtie", "behind_filters", "large_bowtie", "roi_bowtie"]
+__all__ = ["Bowtie", "large_bowtie", "roi_bowtie"]
 
 Floats = NDArray[np.float64]
 

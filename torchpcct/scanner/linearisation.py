@@ -23,7 +23,7 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.threads import run
 from torchpcct.validate import number, numbers, reals, whole
 
-__all__ = ["POLYNOMIAL_UP_TO", "WaterLinearisation"]
+__all__ = ["WaterLinearisation"]
 
 Floats = NDArray[np.float64]
 

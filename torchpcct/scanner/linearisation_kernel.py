@@ -11,9 +11,6 @@ if TYPE_CHECKING:
     from torchpcct.typing import Floats, Ints, Reals
 
 
-__all__ = ["evaluate"]
-
-
 @njit(nogil=True, cache=True)
 def evaluate(
     begin: int,

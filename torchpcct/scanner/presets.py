@@ -18,16 +18,7 @@ from torchpcct.scanner.source import Source
 from torchpcct.scene.materials import MATERIALS
 from torchpcct.validate import checked, choice
 
-__all__ = [
-    "EID_OFFSET_COLUMNS",
-    "EID_PITCH_MM",
-    "EID_VIEWS",
-    "FLAT_FILTER_MM",
-    "PCCT_PITCH_MM",
-    "PCCT_VIEWS",
-    "eid",
-    "pcct",
-]
+__all__ = ["eid", "pcct"]
 
 PCCT_VIEWS = 1968
 """Published views per turn of the PCCT."""

@@ -20,7 +20,7 @@ from torchpcct.scanner.source import Slabs, Source, slabs
 from torchpcct.scene.materials import MATERIALS, Material
 from torchpcct.validate import number
 
-__all__ = ["PILE_UP_ORDER", "Scanner"]
+__all__ = ["Scanner"]
 
 Floats = NDArray[np.float64]
 

@@ -25,7 +25,7 @@ from torchpcct.scanner.detector import SiliconDetector
 from torchpcct.scene.materials import MATERIALS
 from torchpcct.validate import checked, number, whole
 
-__all__ = ["Deposits", "Stack", "TransportedSilicon", "efficiency", "follow"]
+__all__ = ["TransportedSilicon"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -12,15 +12,7 @@ from numpy.typing import NDArray
 from torchpcct.scene.materials import MATERIALS, Material
 from torchpcct.validate import number, numbers, reals
 
-__all__ = [
-    "ANODE_ANGLE_DEG",
-    "INHERENT_ALUMINIUM_MM",
-    "TUBE_OUTPUT",
-    "Slabs",
-    "Source",
-    "Spectrum",
-    "slabs",
-]
+__all__ = ["Source", "Spectrum"]
 
 Floats = NDArray[np.float64]
 Slabs = tuple[tuple[Material, float], ...]

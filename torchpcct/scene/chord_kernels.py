@@ -19,27 +19,15 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "BOX",
-    "BULGED",
-    "CYLINDER",
-    "ELLIPSOID",
-    "NARROWED",
-    "chords",
-    "chords_from",
-    "interval",
-    "may_meet",
-]
-
 # Kinds of packed shapes.
 ELLIPSOID, CYLINDER, BOX, BULGED, NARROWED = range(5)
-# Contraction to FMA is safe; reassociation would undo the cancellation-free order of the operations
-# below. Functions that take a row are inlined: else numba counts references to it, and all threads
-# would fight for the counter.
 _FAST = {"contract", "arcp", "nsz"}
-# Pieces a steep ray is cut into over the bulge; each is searched for one extremum and its
-# crossings.
+"""Contraction to FMA is safe; reassociation would undo the cancellation-free order of the
+operations below. Functions that take a row are inlined: else numba counts references to it, and all
+threads would fight for the counter."""
 _PIECES = 64
+"""Pieces a steep ray is cut into over the bulge; each is searched for one extremum and its
+crossings."""
 
 
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")

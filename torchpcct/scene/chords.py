@@ -34,25 +34,24 @@ from torchpcct.scene.chord_kernels import (
     ELLIPSOID,
     NARROWED,
     chords,
-    interval,
 )
 from torchpcct.scene.tubes import BulgedTube, NarrowedTube
 from torchpcct.threads import run
 from torchpcct.validate import checked
 
-__all__ = ["PARAMETERS", "chord_lengths", "interval", "pack"]
+__all__ = ["chord_lengths"]
 
-# Row of ``params``: 0-2 centre of the bounding z cylinder, 3 its radius squared, 4 radius, 5 half
-# height; 6-8 position; 9-17 matrix from scanner to local axes (scaled to the unit shape for
-# ellipsoid, cylinder section and box); 18 half length; 19-23 tubes: radius, amplitude, 2 π / bulge
-# length, bulge length / 2, largest slope of the fast path.
 PARAMETERS = 24
+"""Row of ``params``: 0-2 centre of the bounding z cylinder, 3 its radius squared, 4 radius, 5 half
+height; 6-8 position; 9-17 matrix from scanner to local axes (scaled to the unit shape for
+ellipsoid, cylinder section and box); 18 half length; 19-23 tubes: radius, amplitude, 2 π / bulge
+length, bulge length / 2, largest slope of the fast path."""
 
-# Largest phase of the profile (rad) that the series in the kernels carry to 1e-11.
 _SERIES = 0.7
-# The bounding cylinder is a little wider than the shape, so that rounding never rejects a ray that
-# grazes it.
+"""Largest phase of the profile (rad) that the series in the kernels carry to 1e-11."""
 _SLACK = 1.0 + 1e-9
+"""The bounding cylinder is a little wider than the shape, so that rounding never rejects a ray that
+grazes it."""
 
 
 def _slope_limit(shape: Any) -> float:

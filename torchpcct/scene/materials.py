@@ -25,14 +25,11 @@ from numpy.typing import NDArray
 from torchpcct.validate import checked, number, reals
 
 __all__ = [
-    "FRACTION_TOLERANCE",
     "MATERIALS",
-    "PLAQUE_MATERIALS",
     "Material",
     "blend",
     "calcification",
     "compound",
-    "formula_mass_fractions",
     "material",
     "mixture",
     "solution",

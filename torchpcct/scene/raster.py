@@ -17,7 +17,8 @@ from scipy import ndimage
 from torchpcct.geometry import VolumeGrid
 from torchpcct.kernel_cache import forget_outdated
 from torchpcct.scene.bodies import Shape
-from torchpcct.scene.chords import interval, pack
+from torchpcct.scene.chord_kernels import interval
+from torchpcct.scene.chords import pack
 from torchpcct.threads import run
 from torchpcct.validate import checked, whole
 

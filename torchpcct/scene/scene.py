@@ -25,12 +25,12 @@ from torchpcct.scene.materials import material as material_of
 from torchpcct.scene.motion import SinusoidalMotion
 from torchpcct.validate import checked
 
-__all__ = ["Body", "Scene", "voxel_centres"]
+__all__ = ["Body", "Scene"]
 
 Floats = NDArray[np.float64]
 
-# Bodies may touch: relative overlap of two surfaces that still counts as touching.
 _TOUCH = 1e-7
+"""Bodies may touch: relative overlap of two surfaces that still counts as touching."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.scene.materials import MATERIALS, Material, material
 from torchpcct.validate import checked, choice
 
-__all__ = ["BODY_TISSUES", "DENSE", "VoxelScene"]
+__all__ = ["VoxelScene"]
 
 Floats = NDArray[np.float64]
 

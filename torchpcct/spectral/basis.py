@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from torchpcct.scene.materials import Material, material
 from torchpcct.validate import checked
 
-__all__ = ["FIT_ENERGIES_KEV", "Basis", "pe_pvc"]
+__all__ = ["Basis", "pe_pvc"]
 
 Floats = NDArray[np.float64]
 

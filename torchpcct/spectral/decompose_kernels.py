@@ -22,9 +22,6 @@ if TYPE_CHECKING:
 
     from torchpcct.typing import Floats, Ints, Reals
 
-
-__all__ = ["expected", "solve"]
-
 # exp(x) = 2^k exp(r): one loop without branches or calls, which LLVM turns into vector instructions
 # (numba calls the scalar libm otherwise: 4 times slower). Adding MAGIC leaves round(x / ln 2) in
 # the low bits of the sum.
@@ -38,8 +35,8 @@ _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9, _C10, _C11 = (1.0 / math.factorial(k) fo
 _LOWEST = -300.0
 _HIGHEST = 200.0
 
-# After so many steps they are halved, after twice as many quartered, …
 _PATIENCE = 40
+"""After so many steps they are halved, after twice as many quartered, …"""
 
 _SUM = {"reassoc", "contract", "nsz"}
 

@@ -26,7 +26,7 @@ from torchpcct.spectral.decompose_kernels import expected
 from torchpcct.threads import run
 from torchpcct.validate import reals, shaped
 
-__all__ = ["ONE_BIN", "SpectralModel", "one_bin"]
+__all__ = ["SpectralModel"]
 
 Floats = NDArray[np.float64]
 

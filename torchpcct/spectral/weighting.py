@@ -34,7 +34,7 @@ from torchpcct.scanner.scanner import PILE_UP_ORDER, Scanner
 from torchpcct.scene.materials import MATERIALS, Material, material
 from torchpcct.validate import checked, choice, number, reals
 
-__all__ = ["BinWeights", "bin_weights", "contrast_information", "weighted_scan", "weighting_gain"]
+__all__ = ["BinWeights", "bin_weights", "contrast_information", "weighting_gain"]
 
 Floats = NDArray[np.float64]
 

@@ -23,8 +23,6 @@ from train.scenes.scene import (
     is_paper_family,
 )
 
-__all__ = ["STEP", "Draw", "curve", "draw_scene", "vessel_table"]
-
 STEP = 0.2
 """Distance of the nodes of a centreline, mm."""
 BEYOND = 1.5

@@ -24,9 +24,6 @@ from train.scenes.scene import Tissue
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-
-__all__ = ["HALO", "INNER", "LUMEN", "OUTER", "QUADRIC", "QUADRIC_IN_TUBE", "STENT", "paint"]
-
 OUTER, INNER, LUMEN, QUADRIC, QUADRIC_IN_TUBE, STENT, HALO = range(7)
 """What a body is: the wall's outside, its inside, the lumen; a superquadric, one in a tube's
 frame; wires; fat."""

@@ -22,8 +22,6 @@ from train.scenes.paint_kernels import (
 )
 from train.scenes.scene import COLUMNS, Solid, Tissue, TrainingScene
 
-__all__ = ["Painted", "rasterise"]
-
 CELLS = 2
 """Cells along each edge of a voxel: at voxels of 0.2 mm, averages are within a HU rms of
 converged ones near faces."""

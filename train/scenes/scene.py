@@ -29,19 +29,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-__all__ = [
-    "COLUMNS",
-    "Bump",
-    "Halo",
-    "SceneConfig",
-    "Solid",
-    "Stent",
-    "Texture",
-    "Tissue",
-    "TrainingScene",
-    "Vessel",
-    "is_paper_family",
-]
+__all__ = ["SceneConfig", "TrainingScene"]
 
 Range = tuple[float, float]
 Triple = tuple[float, float, float]

@@ -30,8 +30,6 @@ from torchpcct.metrics.recovery import recovered_contrast
 from torchpcct.scan import Scan
 from torchpcct.volume import Volume
 
-__all__ = ["LEAST_RECOVERY", "METHODS", "anatomy_rows", "anatomy_verdict"]
-
 LEAST_RECOVERY = 0.9
 """Share of what soft FBP recovers of a feature's contrast that a method may not fall below without
 a word."""

@@ -36,20 +36,6 @@ from torchpcct.scene.phantoms import thorax
 from torchpcct.scene.plaque import Plaque, plaque_scene
 from torchpcct.scene.plaque.variants import calcification_bodies, stent_bodies
 
-__all__ = [
-    "CASES",
-    "CONE_GRID",
-    "GRID",
-    "Apply",
-    "Case",
-    "balls",
-    "body_scan",
-    "body_truth",
-    "cone_scan",
-    "cone_truth",
-    "untouched",
-]
-
 KEV = 70.0
 PHOTONS = 3e3
 VIEWS = 360

@@ -49,8 +49,6 @@ from torchpcct.scene.plaque import Plaque, plaque_scene
 from torchpcct.validate import choice, number
 from torchpcct.volume import Volume
 
-__all__ = ["RIGHT_NOISES", "WORSE", "Settings", "figures", "measure", "verdict"]
-
 RIGHT_NOISES = 0.5
 """A result is right if what the case adds is at most half of the noise that the sound scan has
 anyway: 12 % more."""

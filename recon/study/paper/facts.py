@@ -15,25 +15,6 @@ import numpy as np
 
 from torchpcct.scanner import presets
 
-__all__ = [
-    "BACKGROUND",
-    "BOWTIE",
-    "CNR",
-    "DOSES",
-    "FOREGROUND",
-    "FULL_VIEWS",
-    "KERNELS",
-    "MATERIALS",
-    "NOISE_FREE_ROI_HU",
-    "PHANTOM_MM",
-    "PHANTOM_VOXEL_MM",
-    "REALIZATIONS",
-    "ROTATION_S",
-    "SPECTRAL",
-    "TABLE_EXPOSURE_S",
-    "VOXELS_MM",
-]
-
 FULL_VIEWS = {"PCCT": presets.PCCT_VIEWS, "EID-CT": presets.EID_VIEWS}
 """Views per rotation, by the scanner's name. A study with fewer views stands for the same scan,
 thinned out."""

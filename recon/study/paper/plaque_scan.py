@@ -30,24 +30,6 @@ from torchpcct.scanner import Scanner, presets
 from torchpcct.scene import Body, EllipticCylinder, Scene
 from torchpcct.scene.plaque import Plaque
 
-__all__ = [
-    "INSET_MM",
-    "REFERENCE_KERNEL",
-    "REFERENCE_VOXEL_MM",
-    "SCANNERS",
-    "PlaqueImage",
-    "PlaqueScan",
-    "Truth",
-    "duty",
-    "enclosing",
-    "equal_dose",
-    "inset_grid",
-    "measure_plaque",
-    "prepare",
-    "reference_fbp",
-    "rod_values",
-]
-
 INSET_MM = (11.3, 9.0, 9.0)
 """Extent (z, y, x) of the reconstructed inset: the paper's 113 × 90 × 90 voxels of 0.1 mm."""
 

@@ -23,8 +23,6 @@ from torchpcct.spectral import (
     vmi,
 )
 
-__all__ = ["SHOWN_KEV", "CalibrationError", "calibration_cases", "calibration_costs", "decomposed"]
-
 SHOWN_KEV = (52.0, 70.0)
 """Energies at which wrong calibrations are compared: the paper's best, and one where contrasts
 are usual."""

@@ -49,8 +49,6 @@ from torchpcct.spectral import (
 from torchpcct.validate import number
 from torchpcct.viz import WINDOW_HU
 
-__all__ = ["Images", "Settings", "checks", "figures", "measure"]
-
 VISIBLE_DICE = 0.5
 """The core counts as visible in a tissue map if its Dice coefficient reaches this. The paper
 judges by eye."""

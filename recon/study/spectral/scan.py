@@ -39,8 +39,6 @@ from torchpcct.spectral import (
 from torchpcct.threads import get_num_threads
 from torchpcct.validate import choice
 
-__all__ = ["BODIES", "FAT_MM", "RULES", "SpectralScan", "Tissues", "truth_labels"]
-
 FAT_MM = 3.2
 """From the vessel's axis on there is only fat."""
 

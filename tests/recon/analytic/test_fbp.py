@@ -15,7 +15,8 @@ from fresh_python import run_python
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.analytic.fbp import Fbp, backproject, fbp, filter_sinogram, interleave
+from recon.analytic.backproject import backproject
+from recon.analytic.fbp import Fbp, fbp, filter_sinogram, interleave
 from recon.names import KERNELS
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid, full_turn

@@ -18,12 +18,13 @@ from recon.evaluate.draws import Draws
 from recon.evaluate.estimates import _Figures, pivot
 from recon.evaluate.experiment import evaluate
 from recon.evaluate.measure import Reader, kept_as
-from recon.evaluate.methods import Method, deepinv_denoiser, denoiser, method_of
+from recon.evaluate.methods import Method, denoiser, method_of
 from recon.evaluate.names import TASKS
 from recon.evaluate.report import COLUMNS, save, text_of
 from recon.evaluate.rivals import tuned
 from recon.evaluate.tasks import AnatomyTask, VesselTask, read_task, task_text
 from recon.evaluate.without_truth import evaluate_scans, evaluate_volumes
+from recon.filters import deepinv_denoiser
 from recon.jobs.store import Store
 from torchpcct import Volume
 from torchpcct.geometry import VolumeGrid

@@ -25,21 +25,16 @@ from torchpcct.projector.cpu.simd import add_lines, spread_line, spread_lines, s
 from torchpcct.projector.cpu.simd_interpolation import add_steps, set_steps
 from torchpcct.threads import run
 
-__all__ = ["backproject", "padded", "project", "tabulate_cells"]
-
-# NaN and Inf must survive, so only the flags that leave them alone.
 _FLAGS = {"contract", "nsz", "arcp", "reassoc"}
-# Slabs farther apart than this part of a layer are interpolated one by one (see
-# tables.layer_spacing).
+"""NaN and Inf must survive, so only the flags that leave them alone."""
 MAX_LAYERS_PER_SLAB = 0.4
-# Slabs closer to the source than this part of the source-detector distance are behind it.
+"""Slabs farther apart than this part of a layer are interpolated one by one (see
+tables.layer_spacing)."""
 NEAREST = 1e-6
-# Slabs of one task of the adjoint: enough to reuse a layer, few enough to share the work. Fixed,
-# for determinism.
+"""Slabs closer to the source than this part of the source-detector distance are behind it."""
 SLAB_BLOCK = 24
-# Of functions that only kernels call. Without wrappers for Python and C they compile faster.
-# Inlined they exist once, in the kernel: of one that is called, a fresh process and one that reads
-# the cache have copies that round differently.
+"""Slabs of one task of the adjoint: enough to reuse a layer, few enough to share the work. Fixed,
+for determinism."""
 INNER: Any = {
     "cache": True,
     "forceinline": True,
@@ -47,6 +42,9 @@ INNER: Any = {
     "no_cpython_wrapper": True,
     "no_cfunc_wrapper": True,
 }
+"""Of functions that only kernels call. Without wrappers for Python and C they compile faster.
+Inlined they exist once, in the kernel: of one that is called, a fresh process and one that reads
+the cache have copies that round differently."""
 # Ray geometry in float64, called per cell and not per voxel.
 _small = njit(**INNER, fastmath=_FLAGS)
 _kernel = njit(nogil=True, cache=True, fastmath=_FLAGS, error_model="numpy")

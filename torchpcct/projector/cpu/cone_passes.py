@@ -11,11 +11,9 @@ from torchpcct.projector.cpu.cone_kernels import backproject, padded, project
 from torchpcct.projector.tables import Tables
 from torchpcct.threads import get_num_threads
 
-__all__ = ["ConePasses"]
-
-# Row sums of the adjoint are made for chunks of views of about this size: large enough to keep all
-# threads busy.
 ROW_SUMS_BYTES = 64 << 20
+"""Row sums of the adjoint are made for chunks of views of about this size: large enough to keep all
+threads busy."""
 
 
 class ConePasses:

@@ -20,18 +20,6 @@ from torchpcct.kernel_cache import forget_outdated
 from torchpcct.projector.cpu.cone_kernels import _depth_line, _edge_line, _kernel, _small
 from torchpcct.projector.cpu.simd import add_edges, sum_edges
 
-__all__ = [
-    "TILE",
-    "backproject",
-    "cell_values",
-    "collect",
-    "deal",
-    "load_image",
-    "project",
-    "spread_tasks",
-    "tabulate",
-]
-
 BLOCK = 16  # slabs per block: their knots fit the second-level cache
 TILE = 32  # pixels of a tile's edge
 

@@ -23,8 +23,6 @@ from torchpcct.projector.rays import Segments, slab_lattice
 from torchpcct.projector.tables import Tables
 from torchpcct.threads import run
 
-__all__ = ["PlanePasses"]
-
 _WIDTHS = (1, 2, 4, 8)
 # Lanes whose positions spread over this many voxels at most reach two, or three, intervals between
 # knots.

@@ -27,8 +27,6 @@ from torchpcct.projector.cpu.vector_kernels import (
     start_ray,
 )
 
-__all__ = ["differentiate_readings", "pose_gradients", "spread_derivatives"]
-
 _small = njit(**INNER)
 
 

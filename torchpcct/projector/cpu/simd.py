@@ -21,8 +21,6 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-__all__ = ["add_edges", "add_lines", "spread_line", "spread_lines", "sum_edges", "sum_lines"]
-
 _FUSED = ("contract", "nsz", "arcp", "reassoc")
 
 

@@ -18,8 +18,6 @@ from numba.extending import intrinsic
 
 from torchpcct.projector.cpu.simd import _written
 
-__all__ = ["add_steps", "set_steps"]
-
 # Eight positions at most this far apart fall on 8, or on 16, neighbouring knots.
 _STEP_OF_8 = 0.999
 _STEP_OF_16 = 2.13

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector.rays import Rays
 
-__all__ = ["Orbits", "Placement", "address", "find_orbits", "no_orbits", "place"]
-
 Ints = NDArray[np.int64]
 _TURNS = [(m, 0) for m in range(4)]
 _SETS = (

@@ -25,19 +25,6 @@ from numba import njit
 from torchpcct.kernel_cache import forget_outdated
 from torchpcct.projector.cpu.cone_kernels import INNER
 
-__all__ = [
-    "NEAREST",
-    "POINT",
-    "SLAB_BLOCK",
-    "backproject_vectors",
-    "cell_parts",
-    "main_axis",
-    "overlap",
-    "place_cell",
-    "project_vectors",
-    "start_ray",
-]
-
 SLAB_BLOCK = 16
 """Slabs of one task of the adjoint."""
 NEAREST = 1e-6

@@ -10,8 +10,6 @@ from torchpcct.projector.cpu.vector_kernels import SLAB_BLOCK, backproject_vecto
 from torchpcct.projector.tables import VectorTables
 from torchpcct.threads import run
 
-__all__ = ["PosePasses", "VectorPasses"]
-
 Floats = NDArray[np.float64]
 
 

@@ -13,8 +13,6 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-__all__ = ["backproject_kernel", "project_kernel"]
-
 
 @triton.jit
 def _read(base, zeta, last):

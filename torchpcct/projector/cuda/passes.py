@@ -11,8 +11,6 @@ from torch import Tensor
 
 from torchpcct.projector.tables import Tables
 
-__all__ = ["GpuPasses", "available", "slices", "workspace"]
-
 
 def available() -> bool:
     """True if Triton is installed."""

@@ -9,10 +9,10 @@ from torchpcct.scene.bodies import EllipticCylinder
 from torchpcct.scene.scene import Body, Scene
 from torchpcct.validate import checked, number
 
-__all__ = ["CTDI_HOLES", "ctdi", "water_cylinder"]
+__all__ = ["ctdi", "water_cylinder"]
 
-# Names of the CTDI phantom's inserts, the centre first, then counter-clockwise from +x.
 CTDI_HOLES = ("centre", "peripheral_0", "peripheral_90", "peripheral_180", "peripheral_270")
+"""Names of the CTDI phantom's inserts, the centre first, then counter-clockwise from +x."""
 
 
 @checked

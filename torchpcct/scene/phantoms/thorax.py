@@ -21,7 +21,7 @@ from torchpcct.scene.bodies import EllipticCylinder
 from torchpcct.scene.scene import Body, Scene
 from torchpcct.validate import checked, numbers
 
-__all__ = ["HEART_CENTER_MM", "RIB_ANGLES_DEG", "thorax"]
+__all__ = ["thorax"]
 
 HEART_CENTER_MM = (14.0, 34.0)
 """Centre of the heart relative to the middle of the body's section, x to the patient's left, y
@@ -34,7 +34,6 @@ the side."""
 _HEART_TILT = math.radians(-22.0)
 _WALL = (145.0, 93.5, 2.0)  # ellipse on which the ribs lie: semi-axes, y of its centre
 
-# name, semi-axes, centre (body frame), turn in degrees, material, parent
 _ELLIPSES: tuple[
     tuple[str, tuple[float, float], tuple[float, float], float, str, str | None], ...
 ] = (
@@ -53,15 +52,16 @@ _ELLIPSES: tuple[
     ("sternum", (19.0, 4.8), (0.0, 95.2), 0.0, "cortical_bone", "muscle"),
     ("sternum_marrow", (18.0, 3.8), (0.0, 95.2), 0.0, "spongiosa", "sternum"),
 )
+"""Name, semi-axes, centre (body frame), turn in degrees, material, parent."""
 
-# Cavities of the heart in its own frame (x along its long axis, towards the apex at the patient's
-# left and front).
 _CHAMBERS = (
     ("left_ventricle", (17.0, 10.5), (23.0, -12.0)),
     ("right_ventricle", (18.0, 8.0), (15.0, 21.0)),
     ("left_atrium", (16.0, 10.0), (-22.0, -18.0)),
     ("right_atrium", (12.0, 13.0), (-33.0, 10.0)),
 )
+"""Cavities of the heart in its own frame (x along its long axis, towards the apex at the patient's
+left and front)."""
 
 
 def _cylinder(

@@ -20,7 +20,7 @@ from torchpcct.scene.plaque.plaque import PAPER_POSITION, Plaque, interpolate_ma
 from torchpcct.scene.scene import Body, Scene
 from torchpcct.validate import checked, choice, whole
 
-__all__ = ["VARIANTS", "calcification_bodies", "plaque_variant", "stent_bodies", "textured"]
+__all__ = ["VARIANTS", "plaque_variant"]
 
 _STRUT_MM = 0.08
 """Radial thickness and height of a stent's ring, mm, common for cobalt chromium."""
