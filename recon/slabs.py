@@ -73,14 +73,15 @@ neighbours' help."""
 _RESERVE = 150 * 10**6
 """Compiled kernels, and what filters work on (:data:`recon.analytic.filter_plan.CHUNK_BYTES`)."""
 _READINGS = 7
+"""Arrays of the size of the readings that live at once while they are prepared."""
 _VOLUMES = 4
-"""Arrays of the size of the readings and of a slab that live at once while either is prepared."""
+"""Arrays of the size of a slab that live at once while it is prepared."""
 _LOOKED_AT = 32
 """Rows in the middle whose readings are tested against their description, at most."""
 _RATE = 4e8
+"""Voxel updates of the backprojection a second on one core."""
 _READ_RATE = 1e8
-"""Voxel updates of the backprojection, and readings that are read and prepared, a second on one
-core."""
+"""Readings that are read and prepared a second on one core."""
 
 
 class StackOptions(TypedDict, total=False):

@@ -15,7 +15,9 @@ from recon.mbir.weights_io import TensorFileError, read_tensors, write_tensors
 from torchpcct.files import LEFTOVER
 
 CHECKPOINT_FORMAT = "torchpcct training checkpoint 2"
+"""What a checkpoint says of itself."""
 UNFINISHED = "checkpoint.next.safetensors"
+"""Name of a checkpoint that is being written."""
 
 
 class CheckpointStore:

@@ -102,6 +102,7 @@ _SITUATIONS = (
     Situation(-50.0, -20.0, patient_mm=200.0),
     Situation(10.0, 40.0, pitch_scale=1.15),
 )
+"""Places of the inset, patients and detectors that scenes are seen in."""
 
 
 @dataclass(frozen=True)

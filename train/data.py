@@ -65,14 +65,17 @@ BODY_HU = 15.0
 """What differs by more from the background is a body; where values differ by more there is an
 edge."""
 FORMAT = "torchpcct training views 1"
+"""What kept views say of themselves."""
 _DRAWS_OF_ROI = 6
 """Random numbers that a small ROI takes."""
 _SIGNAL = 1
+"""Bit of a scene's labels: wholly in the signal."""
 _AROUND = 2
+"""Bit of a scene's labels: wholly in the tissue around it."""
 _EDGE = 4
+"""Bit of a scene's labels: near an edge."""
 _BODY = 8
-"""Bits of a scene's labels: wholly in the signal, wholly in the tissue around it, near an edge,
-in or near a body."""
+"""Bit of a scene's labels: in or near a body."""
 _PIECE = 64
 """Scenes that a process paints before it gives them back."""
 _LEFT_FREE = 0.4

@@ -21,7 +21,9 @@ from torchpcct.files import atomic_write
 logger = logging.getLogger(__name__)
 
 DARKEST_HU = -150.0
+"""What is black in pictures, HU."""
 BRIGHTEST_HU = 450.0
+"""What is white in pictures, HU."""
 SMALLEST_PICTURE = 256
 """Pictures are enlarged by a whole factor until their shorter side has this many pixels."""
 

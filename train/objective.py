@@ -39,14 +39,16 @@ from train.config import ObjectiveConfig
 from train.data import Batch, Data
 
 _TAME_ERROR = 0.02
+"""Squared errors beyond count less than their size: a few scenes (calcifications at high dose)
+would drown all others."""
 _TAME_CONTRAST = 2.0
-"""A few scenes (calcifications at high dose) would drown all others: losses beyond count less
-than their size."""
+"""The same of errors of contrast."""
 _NOISE_FREE_SHARE = 0.5
 """Share of the scenes that are seen without noise too; there that counts so many times more."""
 _LEAST_CONTRAST_HU = 10.0
 """Contrasts below are none: what is read there is invented."""
 _AT_ONCE = 4
+"""Scenes that a validation reconstructs at a time."""
 _FLAT_VOXELS = 5
 """Width of the cube in which the truth must be constant, in voxels of 0.2 mm."""
 _FLAT_HU = 10.0

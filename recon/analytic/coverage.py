@@ -31,26 +31,33 @@ _CENTRE_MARGIN = 8
 
 
 _FEWEST_VIEWS = 24
+"""Views of a windowed scan whose borders are compared with the surround."""
 _FEWEST_CELLS = 500
+"""Cells, each seen in both halves of the views, that the spread of gains is found from."""
 _BLOCKS = 12
+"""Blocks of views in which borders are compared."""
 _BLOCK_SIGMAS = 2.0
+"""Standard errors by which a block must deviate."""
 _MOST_READINGS = 3_000_000
+"""Readings that are looked at; more only cost time."""
 _EVEN = 0.1
 """Relative change over the views of what a row ends at, from which it is no air that is
 described too bright."""
 _SURROUND_TOLERANCE = 0.01
+"""Relative deviation of the readings at a window's borders from its surround that is no finding."""
 _GAIN_TOLERANCE = 0.004
-"""Relative deviation of the readings at a window's borders from its surround, and standard
-deviation of the gains of single cells, that are no finding."""
+"""Standard deviation of the gains of single cells that is no finding."""
 _BORDER = 2
 """Columns at either border of a window that are compared with the surround."""
 _RIM = 0.05
 """Share of the mean line integral of the densest column from which a column passes through the
 object."""
 _STEADY = 0.98
+"""Share of a motion's variance along z that a straight line explains from which it is a table's
+travel."""
 _TRAVEL = 0.25
-"""A motion along z that a straight line explains to this share of its variance, by more than this
-share of the height that the rows cover at the axis, is a table's travel."""
+"""Share of the height that the rows cover at the axis from which such a motion is a table's
+travel."""
 
 
 @checked

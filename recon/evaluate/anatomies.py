@@ -51,6 +51,7 @@ TISSUES_HU: Mapping[str, float] = {
 """CT numbers of the tissues; all but fat, which fills the rest, are those of parts."""
 
 _STRAIGHT = VesselAxis((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+"""A vessel along z."""
 
 
 @dataclass(frozen=True)
@@ -144,10 +145,13 @@ class Anatomy:
 # --- shapes, in the vessel's coordinates: a towards the plaque, b across, s along -----------------
 
 _R = 1.75
+"""Radius of the healthy vessel, mm."""
 _WALL = 0.2
+"""Thickness of its wall, mm."""
 _LUMEN = 1.4
+"""Radius of its lumen, mm."""
 _HALF = 4.4
-"""Radius of the healthy vessel, its wall, radius of its lumen, half of its length, mm."""
+"""Half of its length, mm."""
 _PLAQUE = Plaque(
     position=(0.0, 0.0, 0.0),
     vessel_diameter=3.5,
@@ -266,14 +270,20 @@ def _bulging(s: Floats) -> Floats:
 
 
 _BRANCH = (0.0, math.sin(0.85), math.cos(0.85))
+"""Direction of the branch, (x, y, z)."""
 _THIN = replace(_PLAQUE, cap_thickness=0.12)
+"""The plaque under a thin cap."""
 _PAPER = Plaque(position=(0.0, 0.0, 0.0))
+"""The plaque of the paper."""
 _PAPER_HU = {"wall": 63.5, "fibrous": 103.2, "lumen": 480.0, "core": 41.1}
-"""The plaque of the paper, and what its tissues read on its scanner."""
+"""What the tissues of that plaque read on its scanner, HU."""
 _BENT = VesselAxis((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), 3.5)
+"""A vessel along z that bends towards x, radius in mm."""
 
 _HEALTHY = tuple(_vessel())
+"""Parts of a healthy vessel."""
 _WITH_PLAQUE = tuple(_plaque())
+"""Parts of a vessel with plaque."""
 
 ANATOMIES: dict[str, Anatomy] = {
     "healthy": Anatomy("a healthy vessel in fat, nothing more", (), _HEALTHY),

@@ -52,9 +52,9 @@ _CONTRAST = (-1.0, 1.0)
 _LEAST_SLOPE = 0.05
 """Less contrast than that of the true one cannot be corrected for."""
 _SHARE = 0.01
+"""Share of the voxels of the background in which invented contrast is looked for."""
 _ENOUGH = 200
-"""Of the voxels where nothing is, the share in which something is looked for; so many there must
-be."""
+"""Voxels that there must be for that."""
 
 
 Figure = Jackknifed | float

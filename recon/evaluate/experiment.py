@@ -326,11 +326,13 @@ def _parts(method: Method, k: range) -> tuple[str, ...]:
 
 
 _SECONDS = {"fbp": 0.0, "pwls": 0.5, "mbir": 0.8}
-"""Of a volume of 10⁵ voxels on one core by method; _OTHER_S of a filter or another function,
-_DRAW_S of a noisy scan and its twin with FBP of them (1968 views), _MIB of a process."""
+"""Seconds of a volume of 10⁵ voxels on one core, by method."""
 _OTHER_S = 0.2
+"""The same of a filter or another function."""
 _DRAW_S = 2.0
+"""Seconds of a noisy scan and its twin with FBP of them (1968 views)."""
 _MIB = 2600.0
+"""Memory of a process, MiB."""
 
 
 def _estimate(task: Task, methods: Sequence[Method], n: int) -> tuple[float, float]:

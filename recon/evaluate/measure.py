@@ -32,10 +32,11 @@ Floats = NDArray[np.float64]
 BLOCK = 8
 """Realisations of a piece."""
 OBSERVERS = ("axial", "volume")
+"""Observers by what they look at: the axial slice, or the volume."""
 _CHANNELS = 4
+"""Difference-of-Gaussians channels of an observer beside the signal's own shape."""
 _LOWEST = 0.15
-"""Difference-of-Gaussians channels of an observer beside the signal's own shape; frequency of
-the first, lp/mm."""
+"""Frequency of the first of them, lp/mm."""
 _SEEN_MM = 0.3
 """Standard deviation of the blur through which the observer expects the signal."""
 _LONGEST = 120
@@ -43,12 +44,14 @@ _LONGEST = 120
 _SHIFT_VOXELS = 0.5
 """A volume that lies so much off is on another grid."""
 _SMOOTHED_MM = 0.3
+"""Standard deviation of the Gaussian that errors are smoothed by before invented contrast is looked
+for in them, mm."""
 _SOME_VOXELS = 4000
-"""Invented contrast is looked for in errors smoothed by a Gaussian of this standard deviation,
-in so many voxels."""
+"""Voxels in which it is looked for."""
 _BORDER_HU = 50.0
+"""A border that a reader would take for a wall, HU."""
 _FEWEST = 50
-"""A border that a reader would take for a wall; no shell of fewer voxels."""
+"""Voxels of a shell in which a border is looked for, at least."""
 
 
 @dataclass(frozen=True, eq=False)

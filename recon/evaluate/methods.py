@@ -294,6 +294,7 @@ def _content(folder: Path) -> str:
 
 
 _VOLUMES = (".nii.gz", ".nii", ".mha", ".mhd", ".h5", ".hdf5", ".zarr")
+"""Endings of volumes that are read."""
 
 
 def volume_files(folder: Path) -> dict[str, Path]:

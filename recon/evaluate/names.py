@@ -23,6 +23,7 @@ from torchpcct.validate import choice
 __all__ = ["TASKS"]
 
 _FOLDER = resources.files("recon") / "evaluate" / "tasks"
+"""Of the tasks that come with the package."""
 TASKS: tuple[str, ...] = tuple(
     sorted(Path(str(p)).stem for p in _FOLDER.iterdir() if str(p).endswith(".yaml"))
 )

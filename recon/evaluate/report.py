@@ -28,7 +28,9 @@ from torchpcct.viz import base64_text
 __all__ = ["save", "text_of"]
 
 COLUMNS = ("task", "method", "exposure_s", "figure", "where", "value", "low", "high", "unit", "n")
+"""Of the table ``report.csv``."""
 _WINDOW_HU = (-160.0, 240.0)
+"""Of the pictures: black and white, HU."""
 _STYLE = (
     "body{font:15px/1.5 system-ui,sans-serif;color:#222;max-width:75rem;margin:2rem "
     "auto;padding:0 1rem}"
@@ -40,6 +42,7 @@ _STYLE = (
     "td{background:#f7f9fb}td:first-child,th:first-child{text-align:left}"
     "img{max-width:100%}code{background:#f2f4f6;overflow-wrap:anywhere}"
 )
+"""Of the page."""
 
 
 def text_of(evaluation: Evaluation) -> str:

@@ -52,35 +52,41 @@ Floats = NDArray[np.float64]
 Pair = tuple[Tensor, Tensor]
 
 ROIS = ("small", "slice", "lesion")
+"""Names of the regions in which contrast is read."""
 _PURE = 0.99
+"""Volume fraction of a tissue in the voxels that are read."""
 _MOSTLY = 0.8
-"""Share of a tissue in the voxels that are read; where there are too few, the second."""
+"""The same where there are too few of those."""
 _FEW = 4
+"""Voxels that are too few."""
 _AROUND_MM = 1.5
-"""The background is read as far from the signal."""
+"""The background is read as far from the signal, mm."""
 _SMALL_MM2 = 0.25
 """Area of the small ROIs, about that of the paper's."""
 _NEAR_MM = 0.4
+"""The error is that of bodies and of what lies so close to them, mm."""
 _RIM_MM = 0.8
-"""The error is that of bodies and of what lies so close to them; a rim is looked for so far from
-them."""
+"""A rim is looked for so far from bodies, mm."""
 BESIDE_MM = 0.6
 """So far the blur of an edge reaches; what is so close to the signal is beside it."""
 _ABOUT_MM = 1.5
+"""What lies so close to a body is about it, mm."""
 _SHELL_MM = 0.2
+"""Width of the shells around a body, mm."""
 _INSET_RIM_MM = 0.8
-"""What is about a body; width of the shells around it; of the inset's rim, where little is
-measured."""
+"""Width of the inset's rim, where little is measured, mm."""
 _FLAT_MM = 1.0
+"""Noise is that of voxels so far from any edge, mm."""
 _FLAT_VOXELS = 150
+"""Voxels of a tissue whose noise is read, at least."""
 _KEPT_VOXELS = 2000
-"""Noise is that of voxels so far from any edge; of tissues with so many; of so many at most."""
+"""Voxels of a tissue whose noise is read, at most."""
 _LINES = 32
 """Lines per voxel edge of the true shares: to 0.1 HU rms, 9 HU beside metal of 110 000."""
 _VIEWS = 246
+"""Views that values and limit are summed over: path lengths change slowly from view to view."""
 _SUB_RAYS = 16
-"""Views that values and limit are summed over (path lengths change slowly from view to view),
-beam samples."""
+"""Beam samples of those views."""
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,7 @@ __all__ = ["AnatomyTask", "VesselTask", "VoxelTask", "read_task"]
 Floats = NDArray[np.float64]
 
 _FOLDER = resources.files("recon") / "evaluate" / "tasks"
+"""Of the tasks that come with the package."""
 _KEYS = (
     "name",
     "title",
@@ -55,11 +56,13 @@ _KEYS = (
     "voxels",
     "anatomy",
 )
+"""Of a task in YAML."""
 _VOXEL_MM = 0.2
 """What MBIR's network was trained on."""
 _FEATURE = "feature"
+"""The signal of an anatomy."""
 _FAT = "fat"
-"""The signal of an anatomy; its tissue that is the patient's."""
+"""Its tissue that is the patient's."""
 
 
 def task_text(name: str) -> str:

@@ -29,6 +29,7 @@ LENGTH_MM = 8.0
 wide."""
 
 _PLAQUE = Plaque(position=(0.0, 0.0, 0.0), vessel_length=LENGTH_MM)
+"""Plaque of every vessel."""
 
 
 @dataclass(frozen=True)
@@ -164,9 +165,13 @@ class PaintedVessel:
 
 
 _X = (1.0, 0.0, 0.0)
+"""Unit vector."""
 _Y = (0.0, 1.0, 0.0)
+"""Unit vector."""
 _Z = (0.0, 0.0, 1.0)
+"""Unit vector."""
 _HALF = math.sqrt(0.5)
+"""Both components of a unit vector at 45°."""
 
 SHAPES: dict[str, tuple[VesselAxis, Branch | None]] = {
     "straight": (VesselAxis(_Z, _X), None),

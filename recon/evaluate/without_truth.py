@@ -37,6 +37,7 @@ __all__ = ["evaluate_scans", "evaluate_volumes"]
 
 Record = dict[str, Any]
 _REFERENCE = "fbp:ram-lak"
+"""Linear method without apodisation, which shows the resolution that the data hold."""
 _COARSE = 1.05
 """Cells at the axis: on voxels that are larger FBP would alias noise."""
 _SAME_LIGHT = 0.02

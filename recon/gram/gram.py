@@ -39,23 +39,25 @@ from torchpcct.validate import number
 
 __all__ = ["Gram"]
 
-# Frequencies in plane that are not made definite, in steps of the padded grid's, and at most in
-# periods per voxel. With them changed as well, the error on a vessel was 0.25 % (1968 views of the
-# paper's scan), 1.7 % (360 views) and 2.7 % (40° of those missing), without 0.1 % each, and the
-# least eigenvalue on the grid is the same.
 LOW = 6.0
+"""Frequencies in plane up to so many steps of the padded grid's are not made definite. With them
+changed as well, the error on a vessel was 0.25 % (1968 views of the paper's scan), 1.7 % (360
+views) and 2.7 % (40° of those missing), without 0.1 % each, and the least eigenvalue on the grid is
+the same."""
 LOW_PER_VOXEL = 0.06
+"""Those frequencies in periods per voxel, at most."""
 LEAST_PIVOT = 1e-4
 """Smallest pivot, as a share of the diagonal, that a definite spectrum must have."""
-# Stiffness added between two neighbouring slices at a time, as a share of the mean diagonal, and
-# how often per frequency. Indefinite modes alternate from slice to slice, so this leaves objects
-# that are smooth along z alone.
 STIFFNESS = 2e-2
+"""Stiffness added between two neighbouring slices at a time, as a share of the mean diagonal.
+Indefinite modes alternate from slice to slice, so this leaves objects that are smooth along z
+alone."""
 ADDITIONS = 600
-# Where that does not help: shares of the position-dependent terms that are kept, then shifts of the
-# diagonal.
+"""How often stiffness is added to a frequency, at most."""
 KEPT = (0.5, 0.2, 0.0)
+"""Where stiffness does not help: shares of the position-dependent terms that are kept."""
 SHIFTS = (3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0, 3.0)
+"""Where that does not help either: shifts of the diagonal, as shares of its mean."""
 
 
 def cholesky(kernel: Tensor) -> tuple[Tensor, NDArray[np.bool_]]:
@@ -140,10 +142,10 @@ def _points(terms: int) -> NDArray[np.float64]:
 
 BAND_ENERGY = 1e-13
 """Bands along z whose energy is below this share of the kernel's are dropped (float32 rounding)."""
-# Usual frequency of `information`, line pairs per mm, and the share of it by which others are still
-# averaged over.
 REFERENCE_FREQUENCY = 0.5
+"""Usual frequency of `information`, line pairs per mm."""
 AROUND = 0.2
+"""Share of that frequency by which others are still averaged over."""
 HIGHEST_PER_VOXEL = 0.25
 """Highest frequency per voxel that is looked at: beyond, the corners of the voxels' own spectrum
 say little, and may be negative."""

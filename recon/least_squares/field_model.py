@@ -35,10 +35,10 @@ from recon.least_squares.qggmrf import BoundPrior
 LEAST = 0.02
 """Smallest eigenvalue of K, as a share of the median one: between the views' directions it is 0 or,
 cut off, negative."""
-# Slices that have a K of their own, if waves along z are seen in the outermost of them by this
-# factor less than in the middle.
 NODES = 5
+"""Slices that have a K of their own, if waves along z fade towards the outermost of them."""
 FACTOR = 3.0
+"""How many times weaker than in the middle such waves are seen there."""
 DETERMINED = 0.9
 """Voxels that fewer rays meet than this share of those through the middle are not determined by the
 data. (A ring beyond the field of view, seen by three quarters of the views, converged a hundred

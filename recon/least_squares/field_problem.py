@@ -34,13 +34,15 @@ if TYPE_CHECKING:
 __all__ = ["FieldProblem"]
 
 REFERENCE_VOXEL_MM = 0.25
+"""Voxel that the default prior was chosen on, mm."""
 UNDETERMINED_HU = 10.0
 """Distance from the minimum, beyond the field of view, from which it is named."""
-# Readings that miss the grid see something if the mean of a patch of so many cells each way is
-# above this line integral (half a millimetre of water) and this share of the mean of the readings
-# that meet it.
 PATCH = 8
+"""Cells each way of a patch of readings beside the grid, whose mean tells whether they see
+something."""
 SEES_SOMETHING = (0.01, 0.03)
+"""A patch sees something above this line integral (half a millimetre of water) and this share of
+the mean of the readings that meet the grid."""
 
 
 def field_prior(voxel_mm: float, dimensions: int = 3) -> QGGMRF:

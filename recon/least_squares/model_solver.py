@@ -12,9 +12,10 @@ from recon.least_squares.qggmrf import BoundPrior
 
 ROUNDING = 30.0
 """Steps below this many units of rounding of the first one are noise."""
-# Iterations end when the preconditioned gradient norm has fallen by this factor, or after so many.
 REDUCTION = 3e-3
+"""Iterations end when the norm of the preconditioned gradient has fallen by this factor."""
 MOST = 60
+"""Iterations at most."""
 
 
 class ModelSolver:

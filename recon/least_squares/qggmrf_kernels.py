@@ -18,6 +18,7 @@ import numpy as np
 from numba import njit
 
 _FLAGS = {"contract", "reassoc", "arcp", "nsz"}
+"""Liberties of the compiler: NaN and Inf of an image must survive."""
 _VIEWS_ONLY: Any = {
     "nogil": True,
     "cache": True,

@@ -31,10 +31,10 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, VolumeGrid
 from torchpcct.projector import Projector
 
-# The scanner on which lengths were chosen, that of the paper: detector cell at the axis, radius of
-# the field of view, mm.
 CELL_MM = 0.35 * 626.0 / 1098.0
+"""Detector cell at the axis of the scanner on which lengths were chosen, that of the paper, mm."""
 FIELD_MM = 626.0 * math.sin(0.35 * 1500 / 2 / 1098.0)
+"""Radius of the field of view of that scanner, mm."""
 COARSE_MM = 0.6
 """Voxels of the whole field, and its detector cells at the axis, in mm: about 1 lp/mm. On other
 scanners so many times as large as the field of view is, and not less than a cell."""

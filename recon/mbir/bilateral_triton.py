@@ -13,6 +13,7 @@ import triton.language as tl
 from torch import Tensor
 
 _BLOCK = 256
+"""Voxels of one program."""
 
 
 @triton.jit

@@ -61,15 +61,18 @@ LARGEST_RATIO = 4.0
 """Voxels that rays hardly meet are treated as if their noise were so many times that of the
 middle."""
 BLOCK = 64
+"""Voxels along each axis that a block of the network gives."""
 HALO = 16
+"""Voxels on each side of it that help only, or fade."""
 SURROUND_STRENGTH = 10.0
+"""Strength of the PWLS that takes off the edges, over that of the default prior."""
 SURROUND_STEP_HU = 75.0
-"""Of the PWLS that takes off the edges: strength over that of the default prior, and the step from
-voxel to voxel above which it is one. A threshold that follows the noise would leave a starved scan
-the outline of the body."""
+"""Step from voxel to voxel above which it is an edge, HU. A threshold that follows the noise would
+leave a starved scan the outline of the body."""
 SURROUND_HU = 5.0
+"""Tolerance of that PWLS, HU."""
 SURROUND_PAIRS = 60
-"""Its tolerance, and the most projection pairs."""
+"""Its projection pairs at most."""
 
 
 class FieldGram:

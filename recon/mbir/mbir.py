@@ -37,7 +37,9 @@ __all__ = ["Mbir"]
 _LOG = logging.getLogger(__name__)
 
 SHIPPED = "mbir.safetensors"
+"""File of the weights that ship with the package."""
 WEIGHTS_FORMAT = "torchpcct unrolled weights 2"
+"""What a file of weights says of itself."""
 LARGEST_HU = 2000.0
 """Above the densest calcification of the training, 1800 HU: what reads more is metal."""
 

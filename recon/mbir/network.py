@@ -43,14 +43,18 @@ REFERENCE_SCALE_HU = 200.0
 GUIDE_VOXELS = 1.4
 """Width of the Gaussian that makes the bilateral filter's guide."""
 _FIRST = (2.8, 2.5, 1)
+"""The first run of the bilateral filter: difference of the guide, in noise, that counts as an edge;
+reach and step in voxels."""
 _SECOND = (1.4, 4.0, 2)
-"""The filter is run twice, the second time guided by what the first has left: difference of the
-guide, in noise, that counts as an edge, reach and step in voxels."""
+"""The second run, guided by what the first has left."""
 _SLOPE = 0.1
+"""Of the leaky rectifiers below 0."""
 _LEAST = 1e-3
 """In noise units: what the gate takes for 0."""
 _BLOCK = 2
+"""Edge in voxels of the blocks that become channels."""
 _DEPTH = 3
+"""Levels of resolution."""
 
 
 @dataclass(frozen=True)

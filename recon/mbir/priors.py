@@ -35,7 +35,9 @@ Prior = Callable[..., Tensor]
 """A :class:`recon.mbir.network.Network`, or a module or function with the arguments of its
 ``forward``."""
 _SMOOTHED = [(FILTERS[name], width) for name, width in SMOOTHED_BY.items()]
+"""Filters whose noise is that of the smoothed volume, with the width of that."""
 _ARGUMENTS = "(estimate, towards, condition, smoothed)"
+"""Of a prior's ``forward``, for messages."""
 
 
 class PlugAndPlay(nn.Module):

@@ -29,22 +29,21 @@ from recon.data_term import Quadratic
 from recon.mbir.frequencies import filtered, from_frequencies
 
 _BLOCK = 16
+"""Edge of a block in voxels: at 0.2 mm 3.2 mm, some periods of the finest lines."""
 _STEP = 4
-"""Edge of a block and distance of neighbours in voxels: at 0.2 mm 3.2 mm, some periods of the
-finest lines."""
+"""Distance of neighbouring blocks in voxels."""
 _STRIKING = 4.75
+"""Threshold in root mean squares of a coefficient of noise from which a pattern is put back."""
 _CONTINUED = 2.5
+"""The same from which a pattern is that goes on from a striking one."""
 _BESIDE = 1.5
-"""Thresholds, in root mean squares of a coefficient of noise. Line pairs of 1 mm at 0.35 s / 2 s
-keep 0.58 / 0.85 of their contrast (6 draws), 0.21 / 0.60 if nothing is put back, 0.52 by soft FBP;
-into 24 insets of noise nothing is put. Without following a pattern the first threshold must be
-lower for less: with 4.25 they keep 0.38 / 0.78, and 2 of the 24 insets get stripes at 0.35 s.
-Followed from 4.25 those would have 110 HU. From 2.0 instead of 2.5: 0.61 / 0.86."""
+"""The same from which it goes on beside one."""
 _WHOLE = 1.1
 """What is so many times a threshold counts as a whole."""
 _REACH = 2
 """Blocks on either side that a pattern may go on in."""
 _AXES = (-3, -2, -1)
+"""Of a volume."""
 
 
 def significant_residual(problem: Quadratic, spectrum: Tensor, u: Tensor, damping: float) -> Tensor:

@@ -18,6 +18,7 @@ from torch import Tensor
 from torchpcct.files import atomic_write
 
 _HEADER = {"format", "sha256", "metadata", "sha256_of_metadata"}
+"""Keys that every file has."""
 
 
 class TensorFileError(ValueError):

@@ -32,21 +32,25 @@ __all__ = ["column_test"]
 Floats = NDArray[np.float64]
 
 GAIN_TOLERANCE = 0.03
+"""Deviation of a cell's log signal from its neighbours' that is no finding."""
 AXIS_TOLERANCE = 0.1
-"""Deviation of a cell's log signal from its neighbours' that is no finding; of the cell on the
-axis, where something thin may be."""
+"""The same of the cell on the axis, where something thin may be."""
 PLACE_TOLERANCE = 0.25
 """Columns by which those of even and odd number may lie beside their places."""
 _FEWEST_COLUMNS = 16
+"""Columns of a detector that is tested; of the test of places twice as many."""
 _FEWEST_VIEWS = 32
+"""Views of a scan that is tested."""
 _BLOCKS = 16
+"""Parts of the scan in which a deviation must be found."""
 _WIDTHS = (1, 2, 3)
 """Columns side by side that deviate alike."""
 _SIGMAS = 8.0
+"""Standard errors from which a deviation is none of chance."""
 _ALIKE = 0.25
+"""Share of a deviation by which its neighbours may differ from half of it, the other way."""
 _CONSTANT = 0.3
-"""Standard errors from which a deviation is none of chance; share of it by which its neighbours may
-differ from half of it, the other way; and share of it that every part of the scan must show."""
+"""Share of a deviation that every part of the scan must show."""
 
 
 @checked

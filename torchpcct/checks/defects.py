@@ -32,14 +32,17 @@ GAIN_ERROR = 0.1
 """Deviation of a cell's mean log signal from its neighbours' from which its gain is taken as wrong;
 the calibration in air of a good detector leaves 0.001."""
 _NEIGHBOURS = 4
+"""Cells on either side whose median a cell is compared with."""
 # Share of single lost readings from which zeros up to three wide are taken for lost, too.
 _FREQUENT = 0.005
 _SIGMAS = 8.0
+"""Standard errors from which a deviation is none of chance."""
 _TOGETHER = 2
+"""Most cells of a wrong gain side by side."""
 _BENT = 0.25
+"""The bend beside such cells, over their error, from which it is an outline."""
 _ABOUT = 5
-"""Most cells of a wrong gain side by side; the bend beside them, over their error, that is no
-outline; and the columns to either side in which outlines are looked for."""
+"""Columns to either side in which outlines are looked for."""
 _MIRRORED = 0.25
 """What deviates on the other side by that share, up to its inverse, is an outline."""
 _LASTING = 3

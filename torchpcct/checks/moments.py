@@ -41,23 +41,26 @@ thorax are some 20 HU (pile-up of 10 %), 0.1 % of it come from its bones at 100 
 STEP_TOLERANCE = 0.005
 """Relative error of the steps between views that the moments of a sound scan may show."""
 CENTRE_CELLS = 0.3
+"""Deviation of the centre of mass from its sinusoid that is no finding, root mean square, in cells
+at the axis."""
 CENTRE_RADII = 0.005
-"""Deviation of the centre of mass from its sinusoid that is no finding, root mean square: in cells
-at the axis, and in radii of the object (0.2 % from the bones of a thorax)."""
+"""The same in radii of the object (0.2 % from the bones of a thorax)."""
 AXIAL_ROWS = 0.3
 """Deviation of the height that is no finding, in rows at the axis, beside what the cone's rays
 part by."""
 _SLOW = 8
 """Harmonics of a turn that a motion is looked for in."""
 _SIGMAS = 4.0
+"""Standard errors that a finding stands out by."""
 _LACKING = 0.25
 """Of what cells lack at the ends of the object at most, how much may change with the direction
 besides."""
 _LARGEST_STEP = 0.2
 """Relative error of the steps beyond which nothing is linear."""
 _DIRECTIONS = 24
+"""Fewest directions that are tested."""
 _LEAST_ARC = 0.8 * math.pi
-"""Fewest directions, and the smallest arc of them, that are tested."""
+"""Smallest arc of the directions that are tested, rad."""
 
 Floats = NDArray[np.float64]
 

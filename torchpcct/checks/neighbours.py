@@ -49,38 +49,44 @@ __all__ = ["neighbour_test", "stuck_views"]
 Floats = NDArray[np.float64]
 
 JUMP_STEPS = 0.9
+"""Steps by which two views may lie farther apart than described."""
 OTHER_STEPS = 10.0
+"""Steps by which two views may differ otherwise: plane faces that the rays pass along do."""
 JUMP_CELLS = 0.5
-"""Steps by which two views may lie farther apart than described, by which they may differ otherwise
-(plane faces that the rays pass along do), and cells at the border of the object that are no
-finding."""
+"""Cells at the border of the object by which two views may differ."""
 ALTERNATION = 0.25
 """Shift between views (or columns) that alternate, in cells at the axis, that is no finding."""
 _LEAST_JUMP = 0.75
 """Of a pair's own step, by which it must be longer or shorter to be of views that are missing,
 stuck or exchanged, which a whole step makes; less is of an edge that the rays pass along."""
 _SIGMAS = 8.0
+"""Standard errors by which views must differ, and by which an alternation must stand out."""
 _JUMP_SIGMAS = 10.0
+"""How many times its noise a squared residual must be."""
 _GOES_ON = 0.25
 """Part of a step back that one of the next pairs makes up for at least."""
 _BURST = 25.0
+"""How many times larger than beside it a squared residual must be."""
 _BURST_AT_THE_END = 9.0
-"""How many times larger than beside it a squared residual must be; where a turn closes, the one
-pair of its kind."""
+"""The same where a turn closes, of the one pair of its kind."""
 _SHARE = 0.4
+"""Share of the windows on the object that a view at a wrong place changes."""
 _SHARE_AT_THE_END = 0.25
+"""The same of a travel, which only shows where the object has an upper or lower end."""
 _SHARE_OF_MANY = 0.15
+"""The same of many steps forward, beyond the noise."""
 _FEW_WINDOWS = 5
-"""Share of the windows on the object that a view at a wrong place changes, that a travel changes
-which only shows where the object has an upper or lower end, that many steps forward change beyond
-the noise; and windows below which nearly all must."""
+"""Windows below which nearly all must change."""
 _SCATTER = (0.3, 0.8)
+"""Least and largest median residual, in steps, of angles that scatter; with more the views are in
+no order."""
 _SCATTER_SIGMAS = 5.0
+"""Standard errors by which that residual is none of noise."""
 _LIKE_THE_CHANGE = (0.6, 1.6)
+"""Size of a residual, over that of the change, from and up to which it looks like it."""
 _CLEAR = 0.5
-"""Median residual in steps of angles that scatter (more: the views are in no order), and the
-standard errors by which it is none of noise; share of it that must look like the change; and
-squared change over its noise below which nothing is said. Edges leave up to 0.23 in sound scans."""
+"""Squared change over its noise below which nothing is said. Edges leave up to 0.23 in sound
+scans."""
 _STEPS_A_RESIDUAL = 0.6745 * math.sqrt(7.0)
 """Median size of the residual of angles that scatter independently by one step (normal, rms)."""
 _REACH = 4
@@ -88,26 +94,32 @@ _REACH = 4
 _STEADY = 1.5
 """Steps of this size, in usual ones, and larger are gaps."""
 _ROWS = 6
+"""Groups of detector rows that are looked at one by one, at most."""
 _WINDOW_STEPS = 16.0
+"""Width of a window, in ways of a border point in one step."""
 _LEAST_WINDOW = 12
+"""Columns of the smallest window."""
 _LEAST_STEPS = 5.0
-"""Width of a window in ways of a border point in one step, the smallest in columns, and the
-fewest such ways."""
+"""Fewest ways of a border point in a window."""
 _FEWEST_VIEWS = 24
+"""Views of a scan that is tested."""
 _SLOW_HARMONICS = 4.0
 """Harmonics of a turn up to which the widest windows change; moments of order k have k."""
 _PERIODS = (2, 4, 3)
+"""Views after which an alternation repeats."""
 _STUCK_SHARE = 0.98
+"""Share of equal readings from which a view repeats another."""
 _STUCK_COLUMNS = 16
 """Columns that are looked at together for readings that repeat."""
 _POPULAR = 0.02
 """Share of all readings from which a value is a limit of the detector or one of few, and its
 repetition no surprise."""
 _CHANCE = 1e-9
+"""Probability below which a repetition is none of chance, in all views together."""
 _DARK_VIEWS = 8
+"""Views for which a module of the detector is off at least; shorter ones are interpolated."""
 _DARK_WIDTH = 3
-"""Views for which, and columns side by side that, a module of the detector is off; narrower ones
-are bridged."""
+"""Columns side by side that such a module has at least; narrower ones are interpolated."""
 _MOST = 4_000_000
 """Readings that are looked at; more only cost time."""
 

@@ -60,9 +60,9 @@ CENTRE_TOLERANCE = 0.1
 """Error of the centre in columns that is no finding: alignment, and what interpolation between
 the views leaves."""
 SCALE_TOLERANCE = 0.003
+"""Relative error of the fan angles that is no finding: what mechanics leave."""
 STEP_TOLERANCE = 0.001
-"""Relative errors of the fan angles and of the steps between views that are none: what mechanics
-leave."""
+"""Relative error of the steps between views that is no finding: what mechanics leave."""
 FALSE_ALARMS = 0.0005
 """Share of scans with an error of :data:`CENTRE_TOLERANCE` that are taken for wrong; of faultless
 ones it is less. None of 500 sound scans should be told anything."""
@@ -70,9 +70,10 @@ _COLUMNS = (5, 25)
 """Columns over which the slope is smoothed: a few for small errors, many for those of several
 columns."""
 _DIFFER = 0.03
+"""Mean square of the difference, over that of what changes from view to view, from which opposite
+rays differ."""
 _STRANGERS = 0.3
-"""Mean square of the difference over that of what changes from view to view: from the first one
-opposite rays differ, from the second one they have nothing to do with each other."""
+"""The same from which they have nothing to do with each other."""
 _EXPLAINED = 0.1
 """Share of the difference that a cause must explain to be named where opposite rays have little
 in common."""
@@ -82,6 +83,8 @@ is larger."""
 _KNOWN = 0.1
 """Part of its tolerance to which a size is known at best."""
 _FINE_STEP_RAD = math.radians(2.5)
+"""Step between views in rad below which neighbouring views foretell each other: where they do not,
+the views are out of order."""
 
 Floats = NDArray[np.float64]
 

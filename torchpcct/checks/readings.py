@@ -30,11 +30,15 @@ STARVED_SHARE = 0.05
 CLIPPED_SHARE = 0.005
 """Share of clipped readings from which a volume is wrong for it."""
 OFFSET_SHARE = 0.05
+"""Offset, over the darkest readings, from which it is named."""
 OFFSET_SIGMAS = 4.5
-"""Offset, over the darkest readings, from which it is named; and how well it must be known."""
+"""Standard errors to which an offset must be known to be named."""
 _LEAST_COLUMNS = 24
+"""Columns of a detector that is tested."""
 _LEAST_VIEWS = 16
+"""Views of a scan that is tested."""
 _MOST = 4_000_000
+"""Readings that are looked at; more only cost time."""
 
 
 def reading_warnings(scan: Scan) -> list[str]:
@@ -258,7 +262,9 @@ def _offset(counts: NDArray[np.float64], quantum: float) -> list[str]:
 
 
 _CLASSES = np.linspace(0.0, 1.0, 25)
+"""Quantiles of the readings between which their noise is taken together."""
 _LEAST_CLASSES = 12
+"""Classes that a line through noise and mean is fitted to, at least."""
 
 
 def _transfer(

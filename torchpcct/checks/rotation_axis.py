@@ -33,19 +33,24 @@ from torchpcct.readings import MEDIAN_TO_SD
 __all__ = ["RotationAxis", "axis_column", "rotation_axis"]
 
 LEAST = 0.02
+"""Error in columns below which none is stated, of opposite rays: interpolation between views."""
 LEAST_HALF = 0.05
-"""Error in columns below which none is stated, of opposite rays and of half a turn:
-interpolation between views."""
+"""The same of the two ends of half a turn."""
 _SIGMAS = 3.0
+"""Standard errors of the error that is stated."""
 _COARSE_VIEWS = 48
+"""Views of the first search."""
 _COARSE_STEPS = 64
+"""Places of the axis in the first search."""
 _REACH = 0.45
 """Part of the detector's width, to either side of its middle, where the axis is looked for."""
 _COMPARED = 0.1
+"""Share of what the ends show that must be compared at a place of the axis: air is like air."""
 _LIKE_SIGMAS = 5.0
+"""How much more than noise, in standard errors, opposite rays must resemble each other at the axis;
+of a hundred columns that are tried one shows three by chance."""
 _PART = 8
-"""How much more than noise opposite rays must resemble each other at the axis (of a hundred columns
-that are tried one shows three by chance), and over how many columns products are summed."""
+"""Columns over which products of opposite rays are summed."""
 _UNLIKE = 0.3
 """Squared difference of a half turn's ends over what they show, above which they have nothing in
 common but noise."""
@@ -53,7 +58,9 @@ _NOTHING = (
     "the readings do not tell the axis: where it might be they are no more alike than elsewhere "
     "(nothing but noise, or an object that is round about the axis)"
 )
+"""Said where no place of the axis stands out."""
 _BLOCKS = 16
+"""Blocks of views whose scatter is the error of the axis."""
 _TIED = 1.7
 """Both ends compare the same readings, which counts them twice (√2), and smoothing ties
 neighbouring blocks: measured on 120 simulated half turns."""

@@ -30,8 +30,11 @@ BEYOND = 1.5
 LEAST_LAYER = 0.02
 """Thickness of the fibrous layer that is left where the lumen is widest, mm."""
 IN_LAYER = (Tissue.FIBROUS, Tissue.LAYER)
+"""Tissues of the fibrous layer."""
 IN_WALL = (Tissue.WALL, *IN_LAYER, Tissue.CORE)
+"""Tissues between the vessel's border and the lumen."""
 OUTSIDE = (Tissue.BACKGROUND, Tissue.BESIDE)
+"""Tissues beyond the vessel."""
 
 
 class Draw:

@@ -28,8 +28,11 @@ OUTER, INNER, LUMEN, QUADRIC, QUADRIC_IN_TUBE, STENT, HALO = range(7)
 """What a body is: the wall's outside, its inside, the lumen; a superquadric, one in a tube's
 frame; wires; fat."""
 FAR = 1e3
+"""A distance beyond every inset, mm."""
 TISSUES = len(Tissue)
+"""Number of tissues."""
 BACKGROUND = int(Tissue.BACKGROUND)
+"""Number of what no body covers."""
 
 
 @numba.njit(cache=True, fastmath=True)

@@ -34,6 +34,7 @@ __all__ = ["SceneConfig", "TrainingScene"]
 Range = tuple[float, float]
 Triple = tuple[float, float, float]
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+"""Rows of the unit matrix."""
 WAVES = 64
 """Plane waves in a texture: enough for a marginal distribution that is close to Gaussian."""
 

@@ -37,15 +37,23 @@ from torchpcct.scene.plaque import Plaque, plaque_scene
 from torchpcct.scene.plaque.variants import calcification_bodies, stent_bodies
 
 KEV = 70.0
+"""Energy of the body's scan and of the cone beam's, keV."""
 PHOTONS = 3e3
+"""Photons of a reading in air of the body's scan."""
 VIEWS = 360
+"""Of the body's scan."""
 GRID = VolumeGrid((116, 158), 2.4, (-34.0, -14.0))
+"""On which the body is reconstructed."""
 GEOMETRY = FanBeam(full_turn(VIEWS), 541.0, 949.0, 240, 3.6)
+"""Of the body's scan, mm."""
 CONE = ConeBeam(full_turn(120), 541.0, 949.0, 112, 12, (4.0, 3.6))
+"""Geometry of the cone beam's scan, mm."""
 CONE_PHOTONS = 3e4
+"""Photons of a reading in air of the cone beam's scan."""
 CONE_GRID = VolumeGrid((5, 60, 84), (2.0, 2.4, 2.4))
+"""On which the cone beam's scan is reconstructed."""
 WATER = float(np.ravel(material("water").attenuation(KEV))[0])
-"""Of the body's scan and the cone beam's."""
+"""Attenuation of water at that energy, mm⁻¹."""
 
 Apply = Callable[[Scan, Scan, np.random.Generator], Scan]
 """The noise-free scan, its noisy realisation and a random generator, to the scan that is
@@ -386,6 +394,7 @@ _PLAQUE: dict[str, Case] = {
     "unenhanced": _scanned("an unenhanced vessel", other=True, blood="blood"),
     "no-core": _scanned("no core", other=True, core_contrast=0.0),
 }
+"""Cases of the plaque's scan."""
 
 
 # --- a whole body ---------------------------------------------------------------------------------
@@ -534,14 +543,21 @@ def _line_integrals(scan: Scan, base: float) -> Scan:
 
 
 _TURNED = "the object turned is another object"
+"""Why no test can see it: turned."""
 _MIRRORED = "the object seen in a mirror is another object"
+"""Why no test can see it: mirrored."""
 _SIZED = (
     "an object that is larger by as much and attenuates as much less has the same line integrals"
 )
+"""Why no test can see it: another size."""
 _FAINT = "neighbouring views differ by less than their noise"
+"""Why no test can see it: noise."""
 _WITHIN_EDGES = "cells at edges and bones change the sum of a view by as much"
+"""Why no test can see it: edges."""
 _PLANE = "only the plane of the source has opposite rays, and rows beside it are averaged"
+"""Why no test can see it: a cone beam's rows."""
 _SCALED = "line integrals tell attenuation, not what of it is water's"
+"""Why no test can see it: the value of water."""
 
 _BODY: dict[str, Case] = {
     "sound": Case("nothing", lambda clean, scan, rng: scan),
@@ -727,6 +743,7 @@ _BODY: dict[str, Case] = {
     ),
     "metal": Case("two titanium screws of 12 mm", lambda clean, scan, rng: scan, scene=_implants),
 }
+"""Cases of the body's scan."""
 
 # --- a cone beam ----------------------------------------------------------------------------------
 
@@ -827,9 +844,11 @@ _CONE: dict[str, Case] = {
     ),
     "stuck": Case("twelve views stuck", _read(lambda n, air, rng: _stuck(n, slice(40, 52)))),
 }
+"""Cases of the cone beam's scan."""
 
 CASES: dict[str, Case] = _PLAQUE | {
     f"body-{name}": replace(case, base="body") for name, case in _BODY.items()
 }
+"""All cases by name."""
 CASES |= {f"cone-{name}": replace(case, base="cone") for name, case in _CONE.items()}
 """Name → case. A new one needs nothing but its entry in one of the three tables."""

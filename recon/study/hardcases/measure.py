@@ -71,8 +71,11 @@ DISEASE = (
 )
 """Anatomies that break what a prior for vessels assumes."""
 _ROWS = 20
+"""Detector rows of the plaque's scan."""
 _GRID_MM = (6.4, 9.2, 9.2)
+"""Size of its inset, mm."""
 _COLOURS = {"right": "tab:green", "warned": "tab:orange", "unseen": "tab:grey", "SILENT": "tab:red"}
+"""Of the verdicts."""
 
 
 @dataclass(frozen=True)
@@ -281,6 +284,7 @@ def _cone_base(settings: Settings, pieces: Pieces, progress: Progress) -> _Base:
 
 
 _BASES = {"plaque": _plaque_base, "body": _body_base, "cone": _cone_base}
+"""How the sound scan of each base is made."""
 _METHODS = {
     "plaque": ("fbp", "pwls", "mbir", "tissues"),
     "body": ("fbp", "pwls", "mbir"),
