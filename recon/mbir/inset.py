@@ -79,6 +79,7 @@ class Inset:
             ]
             tests = []
             if not scan.noise_free:
+                report["notes"] = network.notes(report["noise_scale_hu"][0])
                 tests = tested(RESIDUAL_TEST, warnings, problem.residual_test, scan, volume, y)
             if network.known is not None and report[network.known.name]["drawn"]:
                 with torch.no_grad():

@@ -25,6 +25,7 @@ from recon.data_term import Quadratic
 from recon.mbir.known import Drawn, Known
 from recon.mbir.network import Network
 from recon.mbir.priors import Prior, name_of, network_of, prior_of
+from recon.mbir.shown import contrast_note
 from recon.mbir.unrolled import DEFAULT_FIDELITY, Unrolled, fidelity_frequency, low_residual
 from recon.mbir.weights_io import digest, read_tensors
 from recon.result import Result
@@ -342,6 +343,13 @@ class Mbir:
         return torch.nn.functional.avg_pool3d(square[None, None], 3, 1, 1, count_include_pad=False)[
             0, 0
         ].sqrt()
+
+    def notes(self, noise_scale_hu: float) -> list[str]:
+        """What is to be known of a volume of this noise that speaks neither for nor against it
+        (:mod:`recon.mbir.shown`)."""
+        if not self.trained or self.known is not None:
+            return []
+        return contrast_note(self.weights_sha256, noise_scale_hu, self.fidelity)
 
     def noisier_or_quieter(self, scales: Sequence[float]) -> list[float]:
         """Those of the noise scales in HU that the training has not seen."""

@@ -3,6 +3,7 @@ by insertion (:mod:`recon.evaluate.insertion`)."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,6 +17,8 @@ from recon.evaluate.insertion import REFERENCE, ContrastRecovery, InsertedBall, 
 from recon.evaluate.names import check_method
 from recon.jobs.store import Pieces
 from recon.least_squares.inset_problem import InsetProblem
+from recon.mbir.mbir import Mbir
+from recon.mbir.unrolled import DEFAULT_FIDELITY
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import duty
 from recon.study.study import Measured, Progress, StudySettings, silent
@@ -113,7 +116,34 @@ def measure(
         of_draws = [found[exposure, seed] for seed in range(s.seed, s.seed + s.n)]
         rows += [_pooled(exposure, same) for same in zip(*of_draws, strict=True)]
     noise = _noise_scales(clean, _grid(s), s.exposures_s)
-    return Measured(s, {"rows": rows, "reference": REFERENCE, "noise_scale_hu": noise})
+    data = {
+        "rows": rows,
+        "reference": REFERENCE,
+        "noise_scale_hu": noise,
+        "weights_sha256": Mbir.load().weights_sha256,
+    }
+    return Measured(s, data)
+
+
+def shown_by_mbir(report: Mapping[str, Any]) -> str:
+    """The rows of MBIR with the weights that ship, as :mod:`recon.mbir.shown` reads them: JSON.
+
+    Args:
+        report: of this study.
+    """
+    scales = dict(zip(report["settings"]["exposures_s"], report["noise_scale_hu"], strict=True))
+    fidelities = {"mbir": DEFAULT_FIDELITY, "mbir:fidelity=1": 1.0}
+    rows = [
+        {
+            "noise_scale_hu": round(scales[row["exposure_s"]], 3),
+            "fidelity": fidelities[row["method"]],
+            **{key: row[key] for key in ("diameter_mm", "contrast_hu")},
+            **{key: round(row[key], 4) for key in ("recovered", "soft_fbp")},
+        }
+        for row in report["rows"]
+        if row["method"] in fidelities
+    ]
+    return json.dumps({"weights_sha256": report["weights_sha256"], "rows": rows}, indent=1) + "\n"
 
 
 def _grid(settings: Settings) -> VolumeGrid:

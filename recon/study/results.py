@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from recon.evaluate.report import filled
+from recon.mbir.shown import RECOVERY
 from recon.study import registry, report
 
 README_MARKS = ("<!-- results: rendered by torchpcct verify --write -->", "<!-- end of results -->")
@@ -39,9 +40,14 @@ PASSING = (
 Tables are Markdown of records that stand beside them, and hold seconds."""
 
 
+SHOWN = f"recon/mbir/weights/{RECOVERY}"
+"""What MBIR says of small and faint bodies, from the study "recovery"."""
+
+
 def render(root: Path) -> dict[str, str]:
     """File, relative to the repository ``root``, → its text with the committed figures: RESULTS.md,
-    README.md and the ``report.md`` of every study that is committed.
+    README.md, the ``report.md`` of every study that is committed, and what MBIR says of small and
+    faint bodies (:mod:`recon.mbir.shown`).
 
     Raises:
         ValueError: a report, key or figure is missing, a format does not fit, a mark is missing.
@@ -67,7 +73,11 @@ def render(root: Path) -> dict[str, str]:
         )
     block = text[text.index(first) : text.index(last)]
     studies = [study for study in map(registry.folder, registry.STUDIES) if study in found]
+    from recon.study.recovery import shown_by_mbir  # loads numba
+
+    beside_weights = {SHOWN: shown_by_mbir(found["recovery"])} if "recovery" in found else {}
     return {
+        **beside_weights,
         **{
             f"notebooks/{study}/report.md": report.render(study, found[study]) + "\n"
             for study in studies
