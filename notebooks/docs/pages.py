@@ -49,7 +49,7 @@ def public_modules():
 
 
 def canonical(module, name):
-    """Where a name that is handed on is defined, ``(module, name)``."""
+    """Where a name is defined that a module has or hands on, ``(module, name)``."""
     value = getattr(importlib.import_module(module), name)
     if isinstance(value, ModuleType):
         return value.__name__.rpartition(".")[::2]
@@ -62,6 +62,8 @@ def canonical(module, name):
             (a.asname or a.name) == name for a in node.names
         ):
             return node.module, name
+        if isinstance(node, ast.Name) and node.id == name and isinstance(node.ctx, ast.Store):
+            return module, name
     raise LookupError(f"{module}.{name}: nobody defines it")
 
 

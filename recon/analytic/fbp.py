@@ -65,10 +65,11 @@ def filter_sinogram(
 ) -> Tensor:
     """Weight and ramp-filter the rows of a scan: the first half of filtered backprojection.
 
-    The result carries the cosine, angular and redundancy weights, ready for :func:`backproject`.
-    Filtering is linear: after the scan of a background has been filtered once, the scan of a small
-    inset or of other noise in its footprint is filtered from that footprint alone (``held``). The
-    result equals that of the whole rows to rounding.
+    The result carries the cosine, angular and redundancy weights, ready for
+    :func:`~recon.analytic.backproject.backproject`. Filtering is linear: after the scan of a
+    background has been filtered once, the scan of a small inset or of other noise in its footprint
+    is filtered from that footprint alone (``held``). The result equals that of the whole rows to
+    rounding.
 
     Args:
         sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64. Data of
@@ -209,7 +210,8 @@ def fbp(
         kernel: reconstruction kernel ``"soft"``, ``"standard"``, ``"detail"``, ``"bone"``,
             ``"ram-lak"``, or several.
         weights: angular weights that replace the automatic ones, see :func:`filter_sinogram`.
-        motion: displacement of everything in the scan in every view, see :func:`backproject`.
+        motion: displacement of everything in the scan in every view, see
+            :func:`~recon.analytic.backproject.backproject`.
         outside: attenuation in mm⁻¹ (unit of ``sinogram`` per mm) of the object beyond the
             detector's edges, e.g. that of water; 0: there is none, rows that do not end in air are
             inconsistent. None: 0, with a warning if the rows look cut off.
@@ -219,8 +221,9 @@ def fbp(
         Differentiable to any order (columns that were added beyond the edges count as constant).
 
     Raises:
-        ValueError, TypeError: as :func:`filter_sinogram` and :func:`backproject`; views of which
-            more than a quarter is dead; a negative ``outside``.
+        ValueError, TypeError: as :func:`filter_sinogram` and
+            :func:`~recon.analytic.backproject.backproject`; views of which more than a quarter is
+            dead; a negative ``outside``.
 
     Example:
         >>> import numpy as np, torch
@@ -279,7 +282,8 @@ class FbpPlan:
         kernel: reconstruction kernel, or several.
         weights: ``(views, 1)`` or ``(views, columns)`` rad; None:
             :func:`recon.analytic.angular_weights.angular_weights`.
-        motion: displacement of the grids in every view, see :func:`backproject`.
+        motion: displacement of the grids in every view, see
+            :func:`~recon.analytic.backproject.backproject`.
         sides: whether the rows end inside the object at the first and at the last column, and are
             continued there by cylinders of ``outside`` (mm⁻¹).
         window: the readings that are filtered, of rows that need no completion; None: the

@@ -1,9 +1,9 @@
 """Exact intersections of rays with the analytic shapes, as numba kernels that other kernels can
 call.
 
-``pack`` turns shapes into two arrays; :func:`interval` finds where one ray is inside one packed
-shape. All in float64: away from grazing incidence the end points are exact to about 1e-11 mm for
-sources a metre away.
+``pack`` turns shapes into two arrays; :func:`~torchpcct.scene.chord_kernels.interval` finds where
+one ray is inside one packed shape. All in float64: away from grazing incidence the end points are
+exact to about 1e-11 mm for sources a metre away.
 
 Quadrics and boxes are met at most once. The tubes of :mod:`torchpcct.scene.tubes` are not convex:
 
