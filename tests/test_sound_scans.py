@@ -10,7 +10,7 @@ from analytic import Ellipsoid, line_integrals
 from sound_scans import BALL, BOX, CYLINDER, Solid, draw, transmissions
 
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, full_turn
-from torchpcct.checks.opposite_rays import geometry_test
+from torchpcct.checks.conjugate_rays import geometry_test
 
 _SPEC = importlib.util.spec_from_file_location(
     "false_alarms", Path(__file__).parent / "bench/false_alarms.py"

@@ -98,8 +98,8 @@ def parker_share(beta: Floats, gamma: Floats, half_fan: float) -> Floats:
     rise = 2.0 * (half_fan + gamma)  # the line at β < rise is measured again at the end of the scan
     fall = math.pi + 2.0 * gamma
     end = math.pi + 2.0 * half_fan
-    # A ray at the fan's edge in a minimal scan meets its opposite at the very ends: one of the two,
-    # the first, counts.
+    # A ray at the fan's edge in a minimal scan meets its conjugate at the very ends: one of the
+    # two, the first, counts.
     tiny = np.finfo(np.float64).tiny
     up = np.sin(0.5 * math.pi * np.clip(beta / np.maximum(rise, tiny), 0.0, 1.0)) ** 2
     down = (

@@ -197,8 +197,8 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
     """Whether a scan contradicts itself or its description, whatever reconstructs it.
 
     Neighbouring views (:mod:`torchpcct.checks.neighbours`: order, missing, stuck, travel) and
-    columns (:mod:`torchpcct.checks.columns`: gains, places); opposite rays
-    (:mod:`torchpcct.checks.opposite_rays`); where they agree, the moments of the views
+    columns (:mod:`torchpcct.checks.columns`: gains, places); conjugate rays
+    (:mod:`torchpcct.checks.conjugate_rays`); where they agree, the moments of the views
     (:mod:`torchpcct.checks.moments`: no line integrals, motion) of a whole field; lines through the
     object that no view measured; rows that end inside the object; and of a window whether its
     borders see the surround, and its cells have one
@@ -214,9 +214,9 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
     """
     from recon.analytic.water_unit import unit_warnings  # reconstructs, which imports this module
     from torchpcct.checks.columns import column_test
+    from torchpcct.checks.conjugate_rays import geometry_test  # loads scipy.stats
     from torchpcct.checks.moments import moment_test
     from torchpcct.checks.neighbours import neighbour_test
-    from torchpcct.checks.opposite_rays import geometry_test  # loads scipy.stats
     from torchpcct.checks.readings import without_light
 
     whole, window, about = scan, scan.window, (0.0, 0.0)
@@ -232,22 +232,22 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
             lines, circle = rebin_to_circle(lines, geometry)
         except ValueError:  # nearly no circle: only an iterative method takes it
             return []
-        if circle.motion is not None:  # of sources beside the circle opposite rays need not meet
+        if circle.motion is not None:  # of sources beside the circle conjugate rays need not meet
             return []
         geometry = circle.geometry
     if lines.ndim > len(geometry.shape):
         lines = lines[lines.shape[0] // 2]
     if window is not None:
         lines = lines - window.take(scan.surround_line_integrals())
-        opposite = geometry_test(lines, geometry, window, about)
-        return [*_surround_texts(_thinned_out(whole)), *opposite.findings]
+        conjugate = geometry_test(lines, geometry, window, about)
+        return [*_surround_texts(_thinned_out(whole)), *conjugate.findings]
     order = neighbour_test(lines, geometry)
     columns = list(column_test(lines, geometry).findings)
-    # in no order at all: opposite rays and moments are, too
+    # in no order at all: conjugate rays and moments are, too
     if order.findings and "jump" not in order.sizes:
         return [*order.findings, *columns]
-    opposite = geometry_test(lines, geometry)
-    found = [*_stuck_texts(scan, geometry), *order.findings, *opposite.findings]
+    conjugate = geometry_test(lines, geometry)
+    found = [*_stuck_texts(scan, geometry), *order.findings, *conjugate.findings]
     try:
         weights = angular_weights(geometry)
     except ValueError:  # FBP refuses these views, other methods need not

@@ -115,13 +115,13 @@ def filter_sinogram(
 def interleave(sinogram: Tensor, geometry: G) -> tuple[Tensor, G]:
     """Spread the columns over a detector of half the pitch, for scans with a quarter-column offset.
 
-    The opposite ray of a detector shifted by a quarter column falls between two columns. Filtering
+    The conjugate ray of a detector shifted by a quarter column falls between two columns. Filtering
     every view on a grid of half the pitch, zeros between the readings, reaches up to twice the
-    Nyquist frequency of one view; what one view aliases there, its opposite cancels. The windows of
-    :mod:`recon.analytic.ramp` then refer to the doubled Nyquist frequency. Without the offset
+    Nyquist frequency of one view; what one view aliases there, its conjugate cancels. The windows
+    of :mod:`recon.analytic.ramp` then refer to the doubled Nyquist frequency. Without the offset
     nothing cancels: details near the isocentre come out aliased.
 
-    The opposite of a ray falls between two views. What is aliased cancels where neighbouring views
+    The conjugate of a ray falls between two views. What is aliased cancels where neighbouring views
     shift the object by less than half a column: within pitch / (2 · view step) of the axis (of the
     paper's scan 78 mm, of one with 120 views 5 mm). Beyond, the two rays see different places, and
     the aliased details remain; a warning is logged if this radius is less than a quarter of the
@@ -141,27 +141,27 @@ def interleave(sinogram: Tensor, geometry: G) -> tuple[Tensor, G]:
         TypeError: a wrong dtype.
     """
     check_data("sinogram", sinogram, geometry.shape)
-    _check_opposites(beam(geometry))
+    _check_conjugates(beam(geometry))
     # the mean of a reading and a zero is half the reading
     spread = torch.stack([2.0 * sinogram, torch.zeros_like(sinogram)], dim=-1).flatten(-2)
     return spread, geometry.interleaved()
 
 
-def _check_opposites(geometry: Beam) -> None:
-    """Whether the opposite rays that :func:`interleave` relies on were measured, and fall
+def _check_conjugates(geometry: Beam) -> None:
+    """Whether the conjugate rays that :func:`interleave` relies on were measured, and fall
     between two columns."""
     pitch, offset = geometry.column_pitch, geometry.column_offset
     quarters = (geometry.column_positions[0] / pitch) % 0.5
     if abs(quarters - 0.25) > 0.1:
         raise ValueError(
             f"interleave needs columns a quarter pitch beside the axis, offset {offset:g} mm at a "
-            f"pitch of {pitch:g} mm leaves opposite rays on one another: filter the sinogram as it "
-            "is"
+            f"pitch of {pitch:g} mm leaves conjugate rays on one another: filter the sinogram as "
+            "it is"
         )
     _, _, span = view_steps(geometry.angles)
     if span < 2.0 * math.pi:
         raise ValueError(
-            "interleave needs the opposite of every ray, the views cover "
+            "interleave needs the conjugate of every ray, the views cover "
             f"{math.degrees(span):.1f}° of 360°"
         )
     radius = geometry.cell / (2.0 * view_step(geometry.angles))

@@ -34,8 +34,8 @@ from sound_scans import KINDS, Drawn, draw, transmissions
 
 import recon
 from recon.analytic.coverage import consistency_warnings
+from torchpcct.checks.conjugate_rays import geometry_test
 from torchpcct.checks.defects import repair_defects
-from torchpcct.checks.opposite_rays import geometry_test
 from torchpcct.checks.readings import reading_warnings
 from torchpcct.geometry import ConeBeam, VolumeGrid
 

@@ -115,7 +115,7 @@ def test_lines_that_no_view_measured_are_named(kind, radius, degrees, lacking):
         assert float(found[0].split(" in ")[1].split("°")[0]) == pytest.approx(lacking, abs=2.0)
 
 
-def test_a_gap_that_opposite_views_fill_is_none():
+def test_a_gap_that_conjugate_views_fill_is_none():
     def told(views):
         g = FanBeam(np.deg2rad(views), 500.0, 900.0, 256, 1.8)
         lines = line_integrals(g, [Ellipsoid((0.0, 0.0), (110.0, 90.0), value=0.02)], sub=1)
@@ -150,7 +150,7 @@ def test_scans_of_other_objects_are_not_reconstructed_with_the_first_ones_surrou
     reconstruct([clean.with_noise(2.0, 0), clean.with_noise(2.0, 1)], GRID, "fbp")
 
 
-def test_interleave_needs_a_quarter_column_opposite_rays_and_many_views(caplog):
+def test_interleave_needs_a_quarter_column_conjugate_rays_and_many_views(caplog):
     full = FanBeam(full_turn(2000), 500.0, 1000.0, 64, 1.0, 0.25)
     interleave(torch.zeros(full.shape), full)
     odd = replace(full, columns=63, offset=-0.25)
@@ -160,7 +160,7 @@ def test_interleave_needs_a_quarter_column_opposite_rays_and_many_views(caplog):
         with pytest.raises(ValueError, match="quarter"):
             interleave(torch.zeros(bad.shape), bad)
     short = full.select(slice(1300))
-    with pytest.raises(ValueError, match="opposite of every ray"):
+    with pytest.raises(ValueError, match="conjugate of every ray"):
         interleave(torch.zeros(short.shape), short)
     few = replace(full, angles=full_turn(90))
     with caplog.at_level(logging.WARNING):
@@ -269,7 +269,7 @@ def test_fbp_of_a_wrong_rotation_centre_is_named(clean):
     g = noisy.geometry
     wrong = replace(noisy, geometry=replace(g, offset=(g.offset[0], g.offset[1] + g.pitch[1] / 2)))
     found = reconstruct(wrong, GRID, "fbp").report["warnings"]
-    assert any("opposite rays disagree" in text and "too high" in text for text in found)
+    assert any("conjugate rays disagree" in text and "too high" in text for text in found)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ one of twice the frequency and a constant (Helgason 1965, Ludwig 1966, Comm. Pur
 Of a cone beam the sum of a row over its columns tells, too, whether the object rises or sinks
 during the turn.
 
-The sum tells what opposite rays cannot, since it happens to both alike: readings that are no
+The sum tells what conjugate rays cannot, since it happens to both alike: readings that are no
 logarithm of the transmission (pile-up, saturation, scatter, a dark signal, beam hardening) lack
 more where the path is long, so a body that is not round weighs less along its long axis. The
 frequency of the others tells the range of the angles, of a half turn, too.
@@ -295,7 +295,7 @@ def _step(theta: Floats, moments: list[Floats]) -> tuple[float, float, float]:
     together; its error; and what a relative change of the moments by 1 (root mean square), as a
     wave of one turn, would look like, at least 1."""
     if theta.size * view_step(theta) > 1.9 * math.pi:
-        return math.nan, math.inf, 1.0  # opposite rays tell it better
+        return math.nan, math.inf, 1.0  # conjugate rays tell it better
     parts = []
     for order, y in enumerate(moments, start=1):
         orders = (1, 2)[:order]

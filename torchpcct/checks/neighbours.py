@@ -1,5 +1,5 @@
 """Do neighbouring views fit each other? Views in a wrong order, missing, stuck or displaced,
-without opposite rays.
+without conjugate rays.
 
 From view to view an object turns by one step. Means of a view under windows that are wide against
 the way of a point in one step are smooth functions of the angle, whatever the object: their change
@@ -23,7 +23,7 @@ A reading that two views at different angles share to the last digit is no measu
 lets few others do so: a view, or a module of the detector, that was stuck.
 
 What these tests cannot show: changes that are slow against a step (a slow motion that comes back, a
-gantry that speeds up and slows down; opposite rays and moments see those), and anything about an
+gantry that speeds up and slows down; conjugate rays and moments see those), and anything about an
 object that is round about the axis.
 """
 

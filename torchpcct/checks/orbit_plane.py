@@ -3,8 +3,8 @@
 Rows beside the plane are read, too, since cells have a height and noise is averaged. A ray at the
 height v of the detector passes the object at z = v (1 + s / sod) / M, s behind the axis, its
 opposite at v (1 - s / sod) / M. Over rows that lie evenly about the plane all that is odd in v
-cancels, a slope of the object along z first of all. Of what is even, e(v), the opposite rays of the
-mean over −V … V differ, to first order in s / sod, by
+cancels, a slope of the object along z first of all. Of what is even, e(v), the conjugate rays of
+the mean over −V … V differ, to first order in s / sod, by
 
     2 (s / sod) · (e(V) - mean of e),
 
@@ -27,10 +27,10 @@ from torch import Tensor
 from torchpcct.geometry import ConeBeam
 
 _FLAT_CELLS = 1.0
-"""Rows whose opposite rays part by more than so many of them at the border of the field are not
+"""Rows whose conjugate rays part by more than so many of them at the border of the field are not
 averaged."""
 PARTED = 2.5
-"""Times the mean square of what opposite rays part by, as it is here estimated, that they may
+"""Times the mean square of what conjugate rays part by, as it is here estimated, that they may
 differ: 2.1 times at most of 150 sound scans drawn at random (bodies beside the axis, parts of a
 turn, opaque ones)."""
 THIN = 0.5
@@ -47,8 +47,8 @@ class OrbitPlane:
 
     Attributes:
         lines: ``(views, 1, columns)``.
-        parted: mean square by which opposite rays of a sound scan may differ, since they part along
-            z.
+        parted: mean square by which conjugate rays of a sound scan may differ, since they part
+            along z.
         part: of the sum of a view, what changes between the rows and their border, or from row to
             row.
         away: root mean square distance of the object from the axis, over sod.
@@ -177,7 +177,7 @@ def _border(lines: Tensor, geometry: ConeBeam, height: float) -> tuple[Tensor | 
 
 
 def _crossing(lines: Tensor, geometry: ConeBeam, height: float, onward: float) -> Tensor:
-    """What may leave the rows up to a height for those beside them on the way to the opposite ray,
+    """What may leave the rows up to a height for those beside them on the way to the conjugate ray,
     or come from there, ``(views, columns)``.
 
     A body thinner than a row that lies at their border is in one of them from this side, in the

@@ -1,5 +1,5 @@
-"""Opposite rays: where they lie, what they read, and how both change along the columns and with the
-views.
+"""Conjugate rays: where they lie, what they read, and how both change along the columns and with
+the views.
 
 The ray of source angle β and fan angle γ is met again by that of β + π − 2γ and −γ.
 """
@@ -25,14 +25,14 @@ from torchpcct.geometry import ConeBeam, Geometry, view_step
 BLOCKS = 24
 """Parts of the views whose scatter tells the error of a sum."""
 _MOST = 500_000
-"""Readings whose opposites are looked up; more only cost time."""
-# Views beside an opposite angle that are farther apart than so many usual steps do not stand for
+"""Readings whose conjugates are looked up; more only cost time."""
+# Views beside a conjugate angle that are farther apart than so many usual steps do not stand for
 # it.
 _GAP_STEPS = 3.0
 _ROWS = 9
 """Most rows over which slopes are smoothed."""
 _FLAT_CELLS = 2.0
-"""Rows count whose opposite rays part by less, along z."""
+"""Rows count whose conjugate rays part by less, along z."""
 _ALIGNED = {"centre": 0.05, "step": 0.06, "scale": 0.25, "roll": 0.05}
 """Share of the squared difference by which rays may part that looks like a cause at most: of 300
 sound cone beams drawn at random, without noise, 0.021, 0.026, 0.056 and 0.009 (of two plates 0.13
@@ -44,17 +44,17 @@ Pattern = tuple[Tensor, str]
 
 
 class RayPairs:
-    """Readings, those of their opposite rays, and the slopes of both."""
+    """Readings, those of their conjugate rays, and the slopes of both."""
 
-    def __init__(self, rays: OppositeRays, values: Tensor, parted: float = 0.0) -> None:
+    def __init__(self, rays: ConjugateRays, values: Tensor, parted: float = 0.0) -> None:
         self.rays, self._values = rays, values
         angles = rays.geometry.angles
         self._order = np.argsort(angles % (2 * math.pi), kind="stable")
         self._at = np.arange(0, angles.size, max(1, math.ceil(values.numel() / _MOST)))
         self.base = self._order[self._at]
         self.angles = angles[self.base]
-        self.here, self.opposite, self.known = self._look(self.base)
-        self.difference = self.here - self.opposite
+        self.here, self.conjugate, self.known = self._look(self.base)
+        self.difference = self.here - self.conjugate
         self.parted = parted * float(self.known.sum())
         self._slopes: dict[tuple[str, int], tuple[Any, ...]] = {}
         self._whole: dict[int, Tensor] = {}
@@ -76,7 +76,7 @@ class RayPairs:
         if plane is None:
             return None
         fan = geometry.central_fan
-        return cls(OppositeRays(fan, DetectorWindow.full(fan), about), plane.lines, plane.parted)
+        return cls(ConjugateRays(fan, DetectorWindow.full(fan), about), plane.lines, plane.parted)
 
     @classmethod
     def stacked(
@@ -98,10 +98,10 @@ class RayPairs:
                 return None
             parted = _parted(geometry, window, values, about)
             geometry, window, values = _joined_rows(geometry, window, values)
-        return cls(OppositeRays(geometry, window, about), values, parted)
+        return cls(ConjugateRays(geometry, window, about), values, parted)
 
     def _look(self, views: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor]:
-        return self._values[torch.from_numpy(views)], *self.rays.opposite(self._values, views)
+        return self._values[torch.from_numpy(views)], *self.rays.conjugate(self._values, views)
 
     def shifted(self) -> Pattern:
         """Columns described too high."""
@@ -136,7 +136,7 @@ class RayPairs:
         return torch.from_numpy(factor)[:, None].float(), "angles"
 
     def whole(self, columns: int) -> Tensor:
-        """A slope reaches over neighbours: all of them must have an opposite."""
+        """A slope reaches over neighbours: all of them must have a conjugate."""
         if columns not in self._whole:
             known = -self.known.float()[:, None]
             self._whole[columns] = (
@@ -151,7 +151,7 @@ class RayPairs:
         """Smoothed slopes of both rays, raw ones of both, and where they are known."""
         if (along, columns) not in self._slopes:
             pairs = [
-                [_slope(v, *size) for v in (self.here, self.opposite)]
+                [_slope(v, *size) for v in (self.here, self.conjugate)]
                 for size in ((_ROWS, columns), (1, columns // 5))
             ]
             known = self.whole(columns)
@@ -208,7 +208,7 @@ class RayPairs:
 
     @cached_property
     def curvature(self) -> Tensor:
-        """By how much the opposite is too low for having been interpolated in straight lines."""
+        """By how much the conjugate is too low for having been interpolated in straight lines."""
         return self.rays.curvature(self._values, self.base, self.between_views())
 
     @property
@@ -250,7 +250,7 @@ class RayPairs:
         g, w = self.rays.geometry, self.rays.window
         if w.columns != g.columns:
             return False
-        other, known = self.rays.opposite(self._values.flip(-1), self.base)
+        other, known = self.rays.conjugate(self._values.flip(-1), self.base)
         difference = product(self.here.flip(-1) - other, known).sum()
         here = self.here.flip(-1)
         return bool(difference < most * 2.0 * product(here - here.mean(0), known).sum())
@@ -285,7 +285,7 @@ def product(values: Tensor, known: Tensor) -> Floats:
 def _flat_part(
     geometry: ConeBeam, window: DetectorWindow, values: Tensor
 ) -> tuple[DetectorWindow, Tensor]:
-    """The rows whose opposite rays part by less than :data:`_FLAT_CELLS` over what the window
+    """The rows whose conjugate rays part by less than :data:`_FLAT_CELLS` over what the window
     shows."""
     row, column = geometry.pitch
     reach = window.columns * column / geometry.magnification / 2
@@ -303,13 +303,13 @@ def _flat_part(
 def _parted(
     geometry: ConeBeam, window: DetectorWindow, values: Tensor, about: tuple[float, float]
 ) -> float:
-    """Mean square by which opposite rays of rows ``(views, rows, columns)`` may differ, since they
+    """Mean square by which conjugate rays of rows ``(views, rows, columns)`` may differ, since they
     part along z.
 
     To first order by 2 (s / sod) v ∂p/∂v (:mod:`torchpcct.checks.orbit_plane`), v the height of the
     row.
     """
-    rays = OppositeRays(geometry, window, about)
+    rays = ConjugateRays(geometry, window, about)
     if values.shape[1] < 2:
         return 0.0
     turn = geometry.angles
@@ -360,8 +360,8 @@ def _convolved(values: Tensor, rows: int, kernel: Tensor) -> Tensor:
     return F.conv2d(padded, kernel.expand(1, 1, rows, -1) / rows)[:, 0]
 
 
-class OppositeRays:
-    """Where the opposite of a reading lies: view, row and column, all fractional."""
+class ConjugateRays:
+    """Where the conjugate of a reading lies: view, row and column, all fractional."""
 
     def __init__(self, geometry: Any, window: DetectorWindow, about: tuple[float, float]) -> None:
         self.geometry, self.window = geometry, window
@@ -391,8 +391,8 @@ class OppositeRays:
         curved = self.geometry.detector == "curved"
         return np.arctan2(across, depth), np.hypot(across, depth) if curved else depth
 
-    def opposite(self, values: Tensor, base: NDArray[np.int64]) -> tuple[Tensor, Tensor]:
-        """The opposite of every reading ``(base, rows, columns)`` of the views ``base``, and where
+    def conjugate(self, values: Tensor, base: NDArray[np.int64]) -> tuple[Tensor, Tensor]:
+        """The conjugate of every reading ``(base, rows, columns)`` of the views ``base``, and where
         it was measured.
 
         Each pair counts once, with its ray of positive fan angle.
@@ -406,16 +406,16 @@ class OppositeRays:
         return total, known
 
     def curvature(self, values: Tensor, base: NDArray[np.int64], between: Tensor) -> Tensor:
-        """By how much :meth:`opposite` is too low, to second order, since it is interpolated in
+        """By how much :meth:`conjugate` is too low, to second order, since it is interpolated in
         straight lines.
 
         A second difference D from neighbour to neighbour leaves -s (1 - s) D / 2 at the part s of
         the way.
 
         Args:
-            values, base: see :meth:`opposite`.
+            values, base: see :meth:`conjugate`.
             between: ``(base, rows, columns)``, how far the readings themselves lie from the mean of
-                those in the views before and behind, -D / 2 along the views, which their opposites
+                those in the views before and behind, -D / 2 along the views, which their conjugates
                 share.
         """
         bend = F.pad(values[..., 2:] - 2.0 * values[..., 1:-1] + values[..., :-2], (1, 1))
@@ -433,7 +433,7 @@ class OppositeRays:
     def places(
         self, base: NDArray[np.int64]
     ) -> tuple[list[tuple[NDArray[np.int64], Floats, Floats, Floats]], Tensor]:
-        """The two views that opposites lie between, the part, row and column of each; and which
+        """The two views that conjugates lie between, the part, row and column of each; and which
         rays have a pair.
 
         Views and parts are ``(base, columns)``.

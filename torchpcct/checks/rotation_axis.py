@@ -1,7 +1,7 @@
 """Where is the rotation axis? Found from the readings, with an error that contains the truth.
 
-* Opposite rays that were measured see one line: of a full turn of any beam, or what a scan covers
-  twice (:mod:`torchpcct.checks.opposite_rays`). What all views of a full turn share is taken off
+* Conjugate rays that were measured see one line: of a full turn of any beam, or what a scan covers
+  twice (:mod:`torchpcct.checks.conjugate_rays`). What all views of a full turn share is taken off
   before: the mean over the turn is the same on both sides of the axis, gains of single cells are
   not.
 * Of half a turn of parallel rays the ends meet: the first views, mirrored, go on where the last
@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchpcct.checks.opposite_rays import centre_test
+from torchpcct.checks.conjugate_rays import centre_test
 from torchpcct.checks.orbit_plane import orbit_plane
-from torchpcct.checks.ray_pairs import OppositeRays
+from torchpcct.checks.ray_pairs import ConjugateRays
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry, view_step
 from torchpcct.readings import MEDIAN_TO_SD
@@ -33,7 +33,7 @@ from torchpcct.readings import MEDIAN_TO_SD
 __all__ = ["RotationAxis", "axis_column", "rotation_axis"]
 
 LEAST = 0.02
-"""Error in columns below which none is stated, of opposite rays: interpolation between views."""
+"""Error in columns below which none is stated, of conjugate rays: interpolation between views."""
 LEAST_HALF = 0.05
 """The same of the two ends of half a turn."""
 _SIGMAS = 3.0
@@ -47,10 +47,10 @@ _REACH = 0.45
 _COMPARED = 0.1
 """Share of what the ends show that must be compared at a place of the axis: air is like air."""
 _LIKE_SIGMAS = 5.0
-"""How much more than noise, in standard errors, opposite rays must resemble each other at the axis;
-of a hundred columns that are tried one shows three by chance."""
+"""How much more than noise, in standard errors, conjugate rays must resemble each other at the
+axis; of a hundred columns that are tried one shows three by chance."""
 _PART = 8
-"""Columns over which products of opposite rays are summed."""
+"""Columns over which products of conjugate rays are summed."""
 _UNLIKE = 0.3
 """Squared difference of a half turn's ends over what they show, above which they have nothing in
 common but noise."""
@@ -109,7 +109,7 @@ def rotation_axis(lines: Tensor, geometry: Geometry) -> RotationAxis:
         geometry: parallel, fan or cone beam on a circle.
 
     Raises:
-        ValueError: too few opposite rays (less than half a turn of parallel rays, a fan or cone
+        ValueError: too few conjugate rays (less than half a turn of parallel rays, a fan or cone
             beam that meets hardly any line twice), or nothing to be seen.
     """
     g: Any = geometry
@@ -117,11 +117,11 @@ def rotation_axis(lines: Tensor, geometry: Geometry) -> RotationAxis:
     shared = (
         0.0 if shares is None else torch.tensordot(torch.from_numpy(shares).to(lines), lines, 1)
     )
-    found = _by_opposites(lines - shared, g)
+    found = _by_conjugates(lines - shared, g)
     if found is not None:
         # Of a part of a turn what single cells have wrong stays, and is alike in all views.
         return _stated(
-            found[0], found[1] * (1.0 if shares is not None else 2.0), LEAST, "opposite rays"
+            found[0], found[1] * (1.0 if shares is not None else 2.0), LEAST, "conjugate rays"
         )
     if not g.parallel:
         few = (
@@ -184,8 +184,8 @@ def _turned(angles: Floats) -> Floats:
     return np.mod(turn - begin + 1e-9, 2 * math.pi) - 1e-9
 
 
-def _by_opposites(lines: Tensor, geometry: Any) -> tuple[float, float] | None:
-    """Column and its standard error; None where hardly any ray has an opposite, or they are
+def _by_conjugates(lines: Tensor, geometry: Any) -> tuple[float, float] | None:
+    """Column and its standard error; None where hardly any ray has a conjugate, or they are
     alike by chance."""
     column = _coarse(lines, geometry)
     if column is None:
@@ -205,7 +205,7 @@ def _by_opposites(lines: Tensor, geometry: Any) -> tuple[float, float] | None:
 
 
 def _likeness(lines: Tensor, geometry: Any) -> float:
-    """By how many standard deviations opposite rays resemble each other more than noise does.
+    """By how many standard deviations conjugate rays resemble each other more than noise does.
 
     Of noise alone the products of the two are as often below 0 as above: the sums over parts of the
     views, a few columns wide, tell how far their sum may lie from 0.
@@ -219,15 +219,15 @@ def _likeness(lines: Tensor, geometry: Any) -> float:
     values = values.reshape(geometry.views, 1, geometry.columns)
     window = DetectorWindow.full(geometry)
     base = np.arange(geometry.views)
-    opposite, known = OppositeRays(geometry, window, (0.0, 0.0)).opposite(values, base)
-    products = torch.where(known, values * opposite, 0.0)[:, 0].double()
+    conjugate, known = ConjugateRays(geometry, window, (0.0, 0.0)).conjugate(values, base)
+    products = torch.where(known, values * conjugate, 0.0)[:, 0].double()
     parts = F.pad(products, (0, -products.shape[1] % _PART)).unflatten(1, (-1, _PART)).sum(2)
     spread = float(parts.square().sum().sqrt())
     return float(parts.sum()) / spread if spread > 0 else 0.0
 
 
 def _coarse(lines: Tensor, geometry: Any) -> float | None:
-    """The column at which opposite rays resemble each other most, to about one; of a cone beam
+    """The column at which conjugate rays resemble each other most, to about one; of a cone beam
     in one row."""
     window = DetectorWindow.full(geometry)
     values = lines.detach().to("cpu", torch.float32).reshape(window.shape)
@@ -242,11 +242,11 @@ def _coarse(lines: Tensor, geometry: Any) -> float | None:
     here, window = middle[torch.from_numpy(base)], DetectorWindow.full(geometry)
 
     def likeness(column: float) -> float:
-        opposite, known = OppositeRays(at_axis(geometry, column), window, (0.0, 0.0)).opposite(
+        conjugate, known = ConjugateRays(at_axis(geometry, column), window, (0.0, 0.0)).conjugate(
             middle, base
         )
         return (
-            float((here * opposite)[known].sum()) if int(known.sum()) > columns // 4 else -math.inf
+            float((here * conjugate)[known].sum()) if int(known.sum()) > columns // 4 else -math.inf
         )
 
     best, reach = (columns - 1) / 2, int(_REACH * columns) // width

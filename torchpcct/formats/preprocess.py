@@ -26,7 +26,7 @@ def find_axis(scan: Scan) -> RotationAxis:
     (:mod:`torchpcct.checks.rotation_axis`).
 
     Raises:
-        ValueError: a part of the detector, a geometry view by view, energy bins; too few opposite
+        ValueError: a part of the detector, a geometry view by view, energy bins; too few conjugate
             rays, or nothing to be seen.
     """
     g = scan.geometry

@@ -83,7 +83,7 @@ def pcct(
             of them.
         kvp, current_ma: tube setting.
         rows, columns: detector cells.
-        quarter_offset: shift the detector by a quarter column, so that opposite views interleave.
+        quarter_offset: shift the detector by a quarter column, so that conjugate rays interleave.
         detector: another silicon detector (then ``mode`` is ignored).
         energy_bin_kev: width of the energy bins of the simulation.
 

@@ -1,4 +1,4 @@
-"""Angular weights: pairs of opposite rays, spacing, short and over-scans."""
+"""Angular weights: pairs of conjugate rays, spacing, short and over-scans."""
 
 import math
 from dataclasses import replace
@@ -34,20 +34,20 @@ def line_of_ray(beta: float, gamma: float) -> tuple[float, float]:
     where=st.floats(0, 1),
     ray=st.floats(-0.999, 0.999),
 )
-def test_pairs_of_opposite_rays_share_one(half_fan, extra, where, ray):
+def test_pairs_of_conjugate_rays_share_one(half_fan, extra, where, ray):
     """w(β, γ) + w(β′, −γ) = 1 on minimal (extra 0), over- and nearly full (extra 1) scans."""
     virtual = half_fan + extra * (math.pi / 2 - 1e-9 - half_fan)
     span = math.pi + 2 * virtual
     gamma = ray * half_fan
     beta = where * span
-    opposite = beta + math.pi - 2 * gamma
-    a, b = line_of_ray(beta, gamma), line_of_ray(opposite, -gamma)
+    conjugate = beta + math.pi - 2 * gamma
+    a, b = line_of_ray(beta, gamma), line_of_ray(conjugate, -gamma)
     # the same line, the other way round
     assert math.isclose(math.cos(a[0] - b[0]), -1, abs_tol=1e-12)
     assert math.isclose(a[1], -b[1], abs_tol=1e-12)
     shares = [
         float(parker_share(np.array(x), np.array(g), virtual))
-        for x, g in ((beta, gamma), (opposite, -gamma), (opposite - 2 * math.pi, -gamma))
+        for x, g in ((beta, gamma), (conjugate, -gamma), (conjugate - 2 * math.pi, -gamma))
     ]
     assert min(shares) >= 0
     assert sum(shares) == pytest.approx(1, abs=1e-12)

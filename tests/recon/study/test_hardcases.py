@@ -40,7 +40,7 @@ def test_a_mended_case_is_right_and_a_refused_one_said(tiny):
     assert any("dead detector cells" in text for text in rows["dead-column"]["messages"])
     assert rows["three-views"]["refused"]
     assert rows["centre-2"]["error_hu"] > rows["centre-2"]["noise_hu"]
-    assert any("opposite rays disagree" in text for text in rows["centre-2"]["messages"])
+    assert any("conjugate rays disagree" in text for text in rows["centre-2"]["messages"])
 
 
 @pytest.mark.extended

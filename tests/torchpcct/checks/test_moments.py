@@ -1,4 +1,4 @@
-"""Moments of the views: constant weight, frequency of the centre of mass; found where opposite
+"""Moments of the views: constant weight, frequency of the centre of mass; found where conjugate
 rays cannot tell."""
 
 import math

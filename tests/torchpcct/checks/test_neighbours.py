@@ -228,7 +228,7 @@ def test_a_table_that_travels_or_wobbles_is_named():
 
 @pytest.mark.parametrize("cycles", [2.0, 3.0, 2.4])
 def test_an_object_that_breathes_is_named(cycles):
-    """Two cycles a turn bring the object back where the opposite ray comes: nothing but the
+    """Two cycles a turn bring the object back where the conjugate ray comes: nothing but the
     moments shows them."""
     g = FanBeam(full_turn(120), 500.0, 900.0, 150, 2.6)
     swing = 4.0 * np.sin(2 * math.pi * cycles * np.arange(g.views) / g.views)

@@ -1,4 +1,4 @@
-"""The plane of the orbit: what opposite rays part by along z is foretold, and rows that part are
+"""The plane of the orbit: what conjugate rays part by along z is foretold, and rows that part are
 not averaged."""
 
 import math
@@ -11,10 +11,10 @@ from analytic import Ellipsoid, line_integrals
 from sound_scans import BALL, BOX, CYLINDER, Solid, transmissions
 
 from torchpcct import ConeBeam, full_turn
+from torchpcct.checks.conjugate_rays import geometry_test
 from torchpcct.checks.moments import moment_test
-from torchpcct.checks.opposite_rays import geometry_test
 from torchpcct.checks.orbit_plane import PARTED, orbit_plane
-from torchpcct.checks.ray_pairs import OppositeRays
+from torchpcct.checks.ray_pairs import ConjugateRays
 from torchpcct.detector_window import DetectorWindow
 
 SOD = 400.0
@@ -34,12 +34,12 @@ def _scanned(g, bodies, photons=None):
 
 
 def _difference(g, plane):
-    """Mean square of what opposite rays differ by."""
+    """Mean square of what conjugate rays differ by."""
     fan = g.central_fan
-    opposite, known = OppositeRays(fan, DetectorWindow.full(fan), (0.0, 0.0)).opposite(
+    conjugate, known = ConjugateRays(fan, DetectorWindow.full(fan), (0.0, 0.0)).conjugate(
         plane.lines, np.arange(g.views)
     )
-    return float((plane.lines - opposite)[known].double().square().mean())
+    return float((plane.lines - conjugate)[known].double().square().mean())
 
 
 @pytest.mark.parametrize("up", [0.0, 1.5, 0.6])
@@ -91,7 +91,7 @@ BETWEEN = {  # a pancake at the border of two rows, a plate that lies within the
 
 @pytest.mark.parametrize("name", BETWEEN)
 def test_a_body_at_the_border_of_two_rows_is_told_nothing(name):
-    """It is in one of them from this side and in the other from that side: opposite rays "disagree
+    """It is in one of them from this side and in the other from that side: conjugate rays "disagree
     by 6 columns", and steps between views are "8.5 % too small"."""
     g, body = BETWEEN[name]
     n = np.random.default_rng(1).poisson(1e5 * transmissions(g, [body], subs=(3, 12, 1)))

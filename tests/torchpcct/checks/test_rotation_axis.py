@@ -149,7 +149,7 @@ def test_half_turns_in_any_order(order):
 
 
 def test_the_error_covers_what_rays_part_by_along_z():
-    """A plate whose face lies in the rows about the plane: opposite rays of a cone differ there,
+    """A plate whose face lies in the rows about the plane: conjugate rays of a cone differ there,
     and pull the axis."""
     rng = np.random.default_rng(0)
     for seed in range(6):
@@ -187,5 +187,5 @@ def test_of_several_slices_the_richest_is_looked_at_and_a_scan_is_centred():
     assert made.info["axis"] == {
         "column": found.column,
         "error": found.error,
-        "found_from": "opposite rays",
+        "found_from": "conjugate rays",
     }

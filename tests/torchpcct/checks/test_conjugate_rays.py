@@ -1,4 +1,4 @@
-"""Opposite rays: their test finds and measures a wrong centre, keeps its rate of false alarms,
+"""Conjugate rays: their test finds and measures a wrong centre, keeps its rate of false alarms,
 and knows its limits."""
 
 import math
@@ -12,8 +12,7 @@ from refusals import refused
 from sound_scans import BOX, CYLINDER, Solid, transmissions
 
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, full_turn
-from torchpcct.checks.moments import moment_test
-from torchpcct.checks.opposite_rays import (
+from torchpcct.checks.conjugate_rays import (
     CENTRE_TOLERANCE,
     FALSE_ALARMS,
     SCALE_TOLERANCE,
@@ -21,7 +20,8 @@ from torchpcct.checks.opposite_rays import (
     centre_test,
     geometry_test,
 )
-from torchpcct.checks.ray_pairs import OppositeRays, RayPairs
+from torchpcct.checks.moments import moment_test
+from torchpcct.checks.ray_pairs import ConjugateRays, RayPairs
 from torchpcct.detector_window import DetectorWindow
 
 VIEWS = 180
@@ -102,7 +102,7 @@ def test_the_order_of_the_views_does_not_matter():
 def test_each_pair_of_rays_counts_once():
     """Twice, the stated error would be too small by √2."""
     g = GEOMETRIES["flat"]  # no offset: the opposite of a column is its mirror image
-    _, known = OppositeRays(g, DetectorWindow.full(g), (0.0, 0.0)).opposite(
+    _, known = ConjugateRays(g, DetectorWindow.full(g), (0.0, 0.0)).conjugate(
         torch.zeros(VIEWS, 1, 128), np.arange(VIEWS)
     )
     assert bool((known | known.flip(-1)).all())
@@ -141,7 +141,7 @@ def test_false_alarms_keep_their_rate(draws):
     assert max(alarms.values()) <= most
 
 
-def test_without_opposite_rays_or_anything_to_see_nothing_is_found():
+def test_without_conjugate_rays_or_anything_to_see_nothing_is_found():
     g = GEOMETRIES["fan"]
     half = g.select(slice(60))
     above = replace(GEOMETRIES["cone"], offset=(40.0, 0.0))
@@ -183,7 +183,8 @@ def test_steps_between_views_of_a_wrong_size_are_found_and_measured(kind, part):
 @pytest.mark.parametrize("kind", ["parallel", "fan"])
 @pytest.mark.parametrize("order", ["from a quarter on", "backwards", "from 0 to 2π"])
 def test_steps_are_measured_wherever_the_turn_begins(kind, order):
-    """The opposite ray was read half a turn later or earlier, which the angle from 0 to 2π does not
+    """The conjugate ray was read half a turn later or earlier, which the angle from 0 to 2π does
+    not
     tell: sizes had the other sign."""
     g = GEOMETRIES[kind]
     begins = {
@@ -307,7 +308,7 @@ def test_rays_that_have_nothing_in_common_are_named():
     assert ["little in common" in text for text in texts] == [False, False, True, True]
 
 
-def test_what_opposite_rays_cannot_show_raises_no_alarm():
+def test_what_conjugate_rays_cannot_show_raises_no_alarm():
     """The angle of the first view; sod; parallel rays' pitch and direction: another object's
     scan, described right."""
     g, parallel = GEOMETRIES["flat"], GEOMETRIES["parallel"]

@@ -1,4 +1,4 @@
-"""Does a full turn agree with itself? Opposite rays see one line, so a wrong description shows
+"""Does a full turn agree with itself? Conjugate rays see one line, so a wrong description shows
 without an image.
 
 The ray of source angle β and fan angle γ is met again by that of β + π − 2γ and −γ (the consistency
@@ -14,7 +14,7 @@ and each error of the description has its own a and e:
 * fan angles (pitch over sdd) too small by the factor 1 + κ: a = 2κγ, nothing in the middle, most at
   the edges;
 * steps between the views too small by the factor 1 + s: a = s (β' − β), β' the described angle at
-  which the scanner was when it read the opposite ray: half a turn later, or earlier.
+  which the scanner was when it read the conjugate ray: half a turn later, or earlier.
 
 r is regressed on each pattern. The slopes of the two rays have independent noise, so the product of
 one's, smoothed, and the other's, raw, neither shrinks nor stretches the estimate (instrumental
@@ -23,17 +23,17 @@ views, which knows nothing of how noisy a reading is: the test statistic is Stud
 that explains most of r is named. Where none does, the share of r in what changes from view to view
 says whether the rays have anything in common; products of neighbouring columns are free of noise.
 
-An object that moves during the turn stands elsewhere when the opposite ray comes: ε then changes
-with β. Of a movement c(β) along the columns, opposite rays show c(β) + c(β + π), so once in a turn
+An object that moves during the turn stands elsewhere when the conjugate ray comes: ε then changes
+with β. Of a movement c(β) along the columns, conjugate rays show c(β) + c(β + π), so once in a turn
 looks like an object that stands elsewhere and is none of our business; twice in a turn is what is
 tested, a wave cos 2β, sin 2β of ε.
 
-What no opposite rays can show, since the described scan is that of another object, a right one: the
-angle of the first view (the object turned), sod (the object scaled, its attenuation the other way;
-so are parallel rays' pitch), both the direction of rotation and that of the columns (the object
-mirrored; of parallel rays each alone), a displacement of the object, and all that happens to both
-rays alike: water's attenuation, gain and bowtie if air was measured with them, spectrum and pile-up
-(:mod:`torchpcct.checks.moments` sees those in bodies that are not round).
+What no conjugate rays can show, since the described scan is that of another object, a right one:
+the angle of the first view (the object turned), sod (the object scaled, its attenuation the other
+way; so are parallel rays' pitch), both the direction of rotation and that of the columns (the
+object mirrored; of parallel rays each alone), a displacement of the object, and all that happens to
+both rays alike: water's attenuation, gain and bowtie if air was measured with them, spectrum and
+pile-up (:mod:`torchpcct.checks.moments` sees those in bodies that are not round).
 """
 
 from __future__ import annotations
@@ -70,12 +70,12 @@ _COLUMNS = (5, 25)
 """Columns over which the slope is smoothed: a few for small errors, many for those of several
 columns."""
 _DIFFER = 0.03
-"""Mean square of the difference, over that of what changes from view to view, from which opposite
+"""Mean square of the difference, over that of what changes from view to view, from which conjugate
 rays differ."""
 _STRANGERS = 0.3
 """The same from which they have nothing to do with each other."""
 _EXPLAINED = 0.1
-"""Share of the difference that a cause must explain to be named where opposite rays have little
+"""Share of the difference that a cause must explain to be named where conjugate rays have little
 in common."""
 _LARGEST = 0.3
 """Relative errors and angles in rad beyond which nothing is linear: no cause is named for what
@@ -96,7 +96,7 @@ def centre_test(
     window: DetectorWindow | None = None,
     about: tuple[float, float] = (0.0, 0.0),
 ) -> ScanTest:
-    """Measure the rotation centre by the opposite rays of a scan, of a cone beam by those near the
+    """Measure the rotation centre by the conjugate rays of a scan, of a cone beam by those near the
     plane of the source.
 
     Args:
@@ -109,7 +109,7 @@ def centre_test(
     Returns:
         The test of ``centre``: how many columns too high the described positions of the columns
         are; and of ``swing``, the amplitude in columns by which it changes twice in a turn.
-        :data:`UNKNOWN` where no opposite rays were measured or nothing is to be seen.
+        :data:`UNKNOWN` where no conjugate rays were measured or nothing is to be seen.
 
     Raises:
         ValueError: a wrong shape, NaN or Inf.
@@ -125,8 +125,8 @@ def geometry_test(
     window: DetectorWindow | None = None,
     about: tuple[float, float] = (0.0, 0.0),
 ) -> ScanTest:
-    """Test the description of a scan by its opposite rays: centre, fan angles, steps between views,
-    roll.
+    """Test the description of a scan by its conjugate rays: centre, fan angles, steps between
+    views, roll.
 
     Args:
         lines, geometry, window, about: see :func:`centre_test`.
@@ -261,7 +261,7 @@ def _unrolled(lines: Tensor, geometry: Any, window: DetectorWindow | None, roll:
 
 def _centre_text(size: float, error: float) -> str:
     return (
-        f"opposite rays disagree: the geometry puts the columns about {abs(size):.2f} ± "
+        f"conjugate rays disagree: the geometry puts the columns about {abs(size):.2f} ± "
         f"{error:.2g} columns too {'high' if size > 0 else 'low'}: the rotation centre (the "
         "detector's column offset) is wrong, or the object moved"
     )
@@ -272,7 +272,7 @@ def _scale_text(size: float, error: float) -> str:
         ("small", "larger", "smaller") if size > 0 else ("large", "smaller", "larger")
     )
     return (
-        f"opposite rays disagree: the fan angles are described about {100 * abs(size):.2g} ± "
+        f"conjugate rays disagree: the fan angles are described about {100 * abs(size):.2g} ± "
         f"{100 * error:.1g} % too {small}: the column pitch is {pitch} than described, the "
         f"distance source-detector (sdd) {sdd}, or the detector is not flat or curved as "
         "described; sizes and values in the volume are wrong by as much"
@@ -281,7 +281,7 @@ def _scale_text(size: float, error: float) -> str:
 
 def _step_text(size: float, error: float) -> str:
     return (
-        "opposite rays disagree: the steps between the views are described about "
+        "conjugate rays disagree: the steps between the views are described about "
         f"{100 * abs(size):.2g} ± {100 * error:.1g} % too {'small' if size > 0 else 'large'}: the "
         "range of the angles is wrong (a full turn?), or views are missing"
     )
@@ -289,7 +289,7 @@ def _step_text(size: float, error: float) -> str:
 
 def _roll_text(size: float, error: float) -> str:
     return (
-        "opposite rays disagree, in higher rows the other way than in lower ones: the detector is "
+        "conjugate rays disagree, in higher rows the other way than in lower ones: the detector is "
         f"rolled by about {math.degrees(abs(size)):.2g} ± {math.degrees(error):.1g}° against the "
         "rotation axis"
     )
@@ -302,16 +302,16 @@ def _mismatch_text(mismatch: float, strangers: bool, mirrored: bool) -> str:
     share = f"{100 * math.sqrt(mismatch):.0f} % of what changes from view to view"
     if mirrored:
         return (
-            f"opposite rays disagree by {share}, but not with the columns counted the other way: "
+            f"conjugate rays disagree by {share}, but not with the columns counted the other way: "
             "reverse the columns, or the sign of the angles"
         )
     if strangers:
         return (
-            f"opposite rays have little in common (they disagree by {share}): the angles of the "
+            f"conjugate rays have little in common (they disagree by {share}): the angles of the "
             "views (sign, range, order), the order of the columns or the axes of the data are wrong"
         )
     return (
-        f"opposite rays disagree by {share}: the object moved, or the order or the angles of "
+        f"conjugate rays disagree by {share}: the object moved, or the order or the angles of "
         "some views are wrong"
     )
 
@@ -432,7 +432,7 @@ def _mismatch(pairs: RayPairs, false_alarms: float) -> tuple[float, int]:
 
     different, stray, *changing = (
         _blocks(product(v, pairs.known), used)
-        for v in (pairs.difference, between, change(pairs.here), change(pairs.opposite))
+        for v in (pairs.difference, between, change(pairs.here), change(pairs.conjugate))
     )
     signal = changing[0] + changing[1]
     if signal.sum() <= 0:
@@ -464,7 +464,7 @@ def _tested(
         findings.append(_centre_text(fit.size, 2.0 * fit.error))
     if swinging < false_alarms / 2:
         findings.append(
-            f"opposite rays disagree by {swing:.2f} columns to either side in the course of a "
+            f"conjugate rays disagree by {swing:.2f} columns to either side in the course of a "
             "turn: the object moved, or the angles of the views are wrong"
         )
     sizes = {"centre": fit.size} | ({} if math.isnan(swing) else {"swing": swing})
