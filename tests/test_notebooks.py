@@ -232,7 +232,7 @@ def test_benchmark_runs(tmp_path):
     notebook = run("fbp_vs_mbir.ipynb", tmp_path, 3600)
     assert len(pictures(notebook)) == 3
     text = "\n".join(o.data.get("text/markdown", "") for o in outputs(notebook) if "data" in o)
-    assert "The limit of the data" in text
+    assert "The Cramér–Rao bound" in text
 
 
 @pytest.mark.extended

@@ -460,7 +460,7 @@ def add_evaluate(commands: Commands) -> None:
         _evaluate,
         "how much dose does a method save at a task?",
         "Measure reconstruction methods, yours too, at tasks, ready or yours, on the same noise "
-        "realisations: dose factors with intervals beside the limit of the data, noise, error, "
+        "realisations: dose factors with intervals beside the Cramér–Rao bound, noise, error, "
         "contrast, detectability, pictures. Finished pieces are kept in the folder: the same "
         "command goes on after an interruption, and a second one with more methods computes only "
         "those.",

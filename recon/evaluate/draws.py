@@ -26,7 +26,7 @@ from recon.analytic.inset import InsetFbp
 from recon.data_term import Quadratic
 from recon.evaluate.methods import Method, noise_of
 from recon.evaluate.response import response, statistic_covariance
-from recon.evaluate.task import Facts, Task
+from recon.evaluate.task import GroundTruth, Task
 from recon.jobs.store import Store
 from recon.least_squares.inset_problem import InsetProblem
 from recon.least_squares.reconstruct import TOLERANCE_HU
@@ -62,7 +62,7 @@ class Draws:
     @property
     def key(self) -> str:
         """Of what does not depend on a method."""
-        return f"1 {self.task.fingerprint}"
+        return f"2 {self.task.fingerprint}"
 
     @cached_property
     def clean(self) -> tuple[Scan, Scan]:
@@ -70,13 +70,13 @@ class Draws:
         return self.task.scans(self.store)
 
     @cached_property
-    def facts(self) -> Facts:
+    def ground_truth(self) -> GroundTruth:
         """Of the task."""
-        found: Facts = self.store.piece(f"{self.prefix}facts", self.key, self._facts)
+        found: GroundTruth = self.store.piece(f"{self.prefix}facts", self.key, self._ground_truth)
         return found
 
-    def _facts(self) -> Facts:
-        return self.task.facts(self.store)
+    def _ground_truth(self) -> GroundTruth:
+        return self.task.ground_truth(self.store)
 
     @cached_property
     def problem(self) -> InsetProblem:

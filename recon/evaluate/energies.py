@@ -24,7 +24,7 @@ from functools import cached_property
 import numpy as np
 
 from recon.evaluate.draws import Draws, Simulated
-from recon.evaluate.task import Facts, Task
+from recon.evaluate.task import GroundTruth, Task
 from recon.jobs.sources import source_digest
 from recon.jobs.store import Store
 from recon.names import CONTRASTS
@@ -148,8 +148,8 @@ class EnergyDraws(Draws):
         present, absent = (scan.weighted(self.weights) for scan in self.bins)
         return present, absent
 
-    def _facts(self) -> Facts:
-        return self.task.facts_of(*self.clean)
+    def _ground_truth(self) -> GroundTruth:
+        return self.task.ground_truth_of(*self.clean)
 
     def draw(self, exposure_s: float, k: int) -> tuple[Simulated, Simulated]:
         """See :meth:`Draws.draw`: the same photons, each in its bin."""

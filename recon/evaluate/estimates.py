@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.evaluate.measure import OBSERVERS, Readings
-from recon.evaluate.task import Facts
+from recon.evaluate.task import GroundTruth
 from torchpcct.metrics.control import controlled_log_variance, controlled_mean
 from torchpcct.metrics.intervals import Estimate, Jackknifed, combined, log_of_sum
 from torchpcct.metrics.observer import d_prime, hotelling_scores
@@ -240,7 +240,7 @@ def records_of(
     readings: Readings,
     base: Readings,
     reference: ReferenceNoise,
-    facts: Facts,
+    ground_truth: GroundTruth,
     true: Floats,
     absent: Floats,
     rois: tuple[str, ...],
@@ -254,7 +254,7 @@ def records_of(
         task, method, exposure_s: what was measured.
         readings: of the method; base: of the linear reference on the same realisations.
         reference: what is exactly known of the reference.
-        facts: of the task.
+        ground_truth: of the task.
         true: ``(rois,)`` contrasts that the signal adds, HU.
         absent: ``(rois,)`` true contrasts without it, HU.
         rois: their names.
@@ -323,7 +323,7 @@ def records_of(
             add("contrast SD at slope 1", roi, own.log_corrected(k), "HU", transform=0.5)
             factor("contrast at slope 1", roi, other.log_relative(k), own.log_relative(k))
     lesion = rois.index("lesion")
-    best = math.log(facts.limit_hu**2 / exposure_s) - _log_of_square(true[lesion])
+    best = math.log(ground_truth.bound_hu**2 / exposure_s) - _log_of_square(true[lesion])
     factor("limit of the data", "lesion", other.log_relative(lesion), best)
     add("CNR", rois[0], own.cnr(0))
     if _value(own.cnr(0)) > 0 and _value(other.cnr(0)) > 0:

@@ -27,7 +27,7 @@ from recon.evaluate.energies import BINS, EnergyDraws, with_bins
 from recon.evaluate.estimates import Record, ReferenceNoise, records_of
 from recon.evaluate.measure import BLOCK, Measurement, Reader, Readings, kept_as
 from recon.evaluate.methods import Method, method_of
-from recon.evaluate.task import Facts, Task
+from recon.evaluate.task import GroundTruth, Task
 from recon.evaluate.tasks import read_task
 from recon.jobs import execute
 from recon.jobs.execute import Job, Unportable
@@ -49,14 +49,14 @@ class TaskResult:
     """What was found of one task, for pictures and text.
 
     Attributes:
-        task, facts: what was looked at.
+        task, ground_truth: what was looked at.
         true_hu: ROI → contrast that the signal adds, background less signal.
         truth: ``(z, y, x)`` HU with the signal.
         volumes: (method, exposure) → first noisy volume, and that of noise-free data.
     """
 
     task: Task
-    facts: Facts
+    ground_truth: GroundTruth
     true_hu: dict[str, float]
     truth: NDArray[np.float32]
     volumes: dict[tuple[str, float], tuple[NDArray[np.float16], NDArray[np.float16]]]
@@ -236,8 +236,8 @@ def _jobs(
     n: int,
     workers: int,
 ) -> list[Job]:
-    """All that an evaluation of a task computes and that is not there yet: scans and facts, then
-    every block of realisations.
+    """All that an evaluation of a task computes and that is not there yet: scans and ground truth,
+    then every block of realisations.
 
     A job draws its realisations for several methods: for all of them, if there are jobs enough for
     all workers.
@@ -251,16 +251,16 @@ def _jobs(
         workers: that take jobs at once.
     """
     task, seed, store = bench.draws.task, bench.draws.seed, bench.draws.store
-    place, first = f"{task.name}/", f"{task.name}: facts"
+    place, first = f"{task.name}/", f"{task.name}: ground truth"
     jobs, scans = [], {f"{task.name}: scan, signal {s}": s for s in ("present", "absent")}
     in_bins = {f"{task.name}: scan in energy bins, signal {s}": s for s in ("present", "absent")}
     weighted = False
-    if not store.has("facts", f"1 {task.fingerprint}"):
+    if not store.has("facts", f"2 {task.fingerprint}"):
         jobs += [Job(name, _do, (given, "scan", signal)) for name, signal in scans.items()]
-        jobs.append(Job(first, _do, (given, "facts"), (f"{place}facts.npz",), tuple(scans)))
+        jobs.append(Job(first, _do, (given, "ground_truth"), (f"{place}facts.npz",), tuple(scans)))
     wanted = _kernels(methods, None)
     exact = [
-        kernel for kernel in wanted if not store.has(f"exact_{kernel}", f"1 {task.fingerprint}")
+        kernel for kernel in wanted if not store.has(f"exact_{kernel}", f"2 {task.fingerprint}")
     ]
     if exact:
         name, made = (
@@ -380,10 +380,10 @@ class _Bench:
         return self._weighted[energies]
 
     def reader_of(self, energies: str | None) -> Reader:
-        """Of their volumes; it needs the facts."""
+        """Of their volumes; it needs the ground truth."""
         if energies not in self._readers:
             draws = self.draws_of(energies)
-            self._readers[energies] = Reader(draws.task, draws.task.truth(draws.facts))
+            self._readers[energies] = Reader(draws.task, draws.task.truth(draws.ground_truth))
         return self._readers[energies]
 
     def scan(self, signal: str) -> None:
@@ -394,8 +394,8 @@ class _Bench:
         in_bins = replace(task, scanner=with_bins(task.scanner))
         in_bins.scan(Store(self.draws.store.folder / BINS), signal)
 
-    def facts(self) -> None:
-        _ = self.draws.facts
+    def ground_truth(self) -> None:
+        _ = self.draws.ground_truth
 
     def exact(self, kernels: Sequence[str]) -> None:
         self.draws.exact_covariances(kernels)
@@ -476,7 +476,7 @@ def _read(bench: _Bench, exposures: Sequence[float], n: int) -> tuple[list[Recor
                 own,
                 base,
                 control,
-                bench.draws_of(e).facts,
+                bench.draws_of(e).ground_truth,
                 *contrasts[e],
                 reader.rois,
                 exact,
@@ -484,7 +484,7 @@ def _read(bench: _Bench, exposures: Sequence[float], n: int) -> tuple[list[Recor
             )
     true_hu = dict(zip(reader.rois, contrasts[reference.energies][0].tolist(), strict=True))
     truth = reader.truth[0].numpy()
-    return records, TaskResult(task, bench.draws.facts, true_hu, truth, volumes)
+    return records, TaskResult(task, bench.draws.ground_truth, true_hu, truth, volumes)
 
 
 def measured_before(

@@ -54,11 +54,11 @@ def task_sections(evaluation: Evaluation) -> list[str]:
     """Markdown of each task."""
     sections = []
     for seen in evaluation.results:
-        task, facts = seen.task, seen.facts
+        task, ground_truth = seen.task, seen.ground_truth
         records = [r for r in evaluation.records if r["task"] == task.name]
         given = {
             "task": task,
-            "values": dict(zip(facts.tissues, facts.values_hu, strict=True)),
+            "values": dict(zip(ground_truth.tissues, ground_truth.values_hu, strict=True)),
             "true_hu": seen.true_hu,
             "found": {tuple(r[k] for k in COLUMNS[1:5]): r for r in records},
             "n": evaluation.settings["n"],
@@ -257,7 +257,7 @@ def _picture(seen: TaskResult) -> Any:
     exposures = sorted({e for _, e in seen.volumes})
     figure = Figure((2.0 * (len(methods) + 1), 2.2 * len(exposures)), dpi=120, layout="constrained")
     axes: Any = figure.subplots(len(exposures), len(methods) + 1, squeeze=False)
-    middle = seen.facts.values_hu[1]
+    middle = seen.ground_truth.values_hu[1]
     low, high = _WINDOW_HU if abs(middle) < 400 else (middle - 300.0, middle + 300.0)
     for row, exposure in zip(axes, exposures, strict=True):
         shown: list[tuple[str, Any]] = [

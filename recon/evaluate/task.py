@@ -40,7 +40,7 @@ from torchpcct.acquisition.acquire import acquire
 from torchpcct.acquisition.path_lengths import tissue_path_lengths
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import VolumeGrid
-from torchpcct.metrics.data_limit import ceiling, information_matrix
+from torchpcct.metrics.cramer_rao import cramer_rao_bound, information_matrix
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.scanner.scanner import Scanner
 from torchpcct.scene.scene import Scene
@@ -90,20 +90,20 @@ _SUB_RAYS = 16
 
 
 @dataclass(frozen=True)
-class Facts:
+class GroundTruth:
     """What holds of a task without noise.
 
     Attributes:
         tissues: names, the signal first, then the background.
         values_hu: what each reads on this scanner at this place, by least squares on the noise-free
             readings.
-        limit_hu: smallest SD at 1 s of any unbiased estimate of background less signal, all
+        bound_hu: smallest SD at 1 s of any unbiased estimate of background less signal, all
             outlines known.
     """
 
     tissues: tuple[str, ...]
     values_hu: tuple[float, ...]
-    limit_hu: float
+    bound_hu: float
 
     @property
     def contrast_hu(self) -> float:
@@ -250,12 +250,12 @@ class Task:
                 store.remove(old)
         return path
 
-    def facts(self, store: Store) -> Facts:
-        """Values of the tissues and the limit of the data; bodies of one material count as one
+    def ground_truth(self, store: Store) -> GroundTruth:
+        """Values of the tissues and the Cramér–Rao bound; bodies of one material count as one
         tissue."""
-        return self.facts_of(*self.scans(store))
+        return self.ground_truth_of(*self.scans(store))
 
-    def facts_of(self, present: Scan, absent: Scan) -> Facts:
+    def ground_truth_of(self, present: Scan, absent: Scan) -> GroundTruth:
         """The same of noise-free scans with and without the signal."""
         seen = SomeViews(present)
         maps = seen.path_lengths(self, list(self._groups.values()))
@@ -267,8 +267,8 @@ class Task:
             _inner(maps[0], seen.weight * change) * seen.scale * seen.share / information[0, 0]
         )
         values[0] = values[1] + differs
-        return Facts(
-            tuple(self._groups), tuple(float(v) for v in values), contrast_limit(information)
+        return GroundTruth(
+            tuple(self._groups), tuple(float(v) for v in values), contrast_bound(information)
         )
 
     @cached_property
@@ -304,10 +304,10 @@ class Task:
         """Share of the background's own body, without others of its material."""
         return self._fractions[self.background]
 
-    def truth(self, facts: Facts) -> tuple[Tensor, Tensor]:
+    def truth(self, ground_truth: GroundTruth) -> tuple[Tensor, Tensor]:
         """HU of every voxel with and without the signal, ``grid.shape`` float32; outside of all
         bodies air."""
-        values = dict(zip(facts.tissues, facts.values_hu, strict=True))
+        values = dict(zip(ground_truth.tissues, ground_truth.values_hu, strict=True))
         outside = 1.0 - np.sum(list(self.shares.values()), axis=0)
         absent = np.sum(
             [
@@ -317,7 +317,7 @@ class Task:
             axis=0,
         )
         absent = absent - 1000.0 * outside
-        present = absent - facts.contrast_hu * self.shares["signal"]
+        present = absent - ground_truth.contrast_hu * self.shares["signal"]
         return torch.from_numpy(present).float(), torch.from_numpy(absent).float()
 
     @cached_property
@@ -513,10 +513,10 @@ class SomeViews:
         return np.asarray(np.linalg.solve(information, right) - 1000.0)
 
 
-def contrast_limit(information: Floats) -> float:
+def contrast_bound(information: Floats) -> float:
     """Smallest SD of an unbiased estimate of the second tissue's value less the first one's, HU."""
     first, second = np.eye(len(information))[:2]
-    return math.sqrt(ceiling(information, second - first).item())
+    return math.sqrt(cramer_rao_bound(information, second - first).item())
 
 
 def _plain(value: Any) -> Any:

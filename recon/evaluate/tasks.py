@@ -18,7 +18,7 @@ from torch import Tensor
 
 from recon.evaluate.anatomies import ANATOMIES, Anatomy
 from recon.evaluate.names import TASKS
-from recon.evaluate.task import BESIDE_MM, Facts, SomeViews, Task, contrast_limit
+from recon.evaluate.task import BESIDE_MM, GroundTruth, SomeViews, Task, contrast_bound
 from recon.evaluate.vessels import SHAPES, PaintedVessel
 from recon.jobs.store import Store
 from recon.mbir.mbir import overlap
@@ -259,10 +259,10 @@ class VesselTask(Task):
         paths = [self.scan_file(store, name) for name in ("present", "absent")]
         if not all(p.exists() for p in paths):
             straight = self._along_z(store, "present"), self._along_z(store, "absent")
-            facts = self.facts_of(*straight)
+            ground_truth = self.ground_truth_of(*straight)
             values = {
                 ("core" if t == "signal" else t): v
-                for t, v in zip(facts.tissues, facts.values_hu, strict=True)
+                for t, v in zip(ground_truth.tissues, ground_truth.values_hu, strict=True)
             }
             for path, core in zip(paths, (values["core"], values["fibrous"]), strict=True):
                 hu = {
@@ -275,9 +275,9 @@ class VesselTask(Task):
         present, absent = (Scan.load(p) for p in paths)
         return present, absent
 
-    def facts(self, store: Store) -> Facts:
+    def ground_truth(self, store: Store) -> GroundTruth:
         """Of the vessel along z: values and limit of other directions differ little."""
-        return self.facts_of(self._along_z(store, "present"), self._along_z(store, "absent"))
+        return self.ground_truth_of(self._along_z(store, "present"), self._along_z(store, "absent"))
 
     @cached_property
     def shares(self) -> dict[str, Floats]:
@@ -363,7 +363,7 @@ class _PaintedTask(Task):
     def _signal_hu(self) -> float:
         return self.tissues_hu[self.signal[0]]
 
-    def facts(self, store: Store) -> Facts:
+    def ground_truth(self, store: Store) -> GroundTruth:
         """The values are given; the limit is that of tissues with these shapes in this patient."""
         seen = SomeViews(self._alone(store))
         project = Projector(seen.geometry, self.grid, seen.window)
@@ -383,8 +383,10 @@ class _PaintedTask(Task):
             (maps | bodies)[tissue]
             for tissue in [*self.shares, *(n for n in bodies if n != self.patient)]
         ]
-        limit = contrast_limit(seen.information(ordered))
-        return Facts(tuple(self.shares), tuple(values[tissue] for tissue in self.shares), limit)
+        limit = contrast_bound(seen.information(ordered))
+        return GroundTruth(
+            tuple(self.shares), tuple(values[tissue] for tissue in self.shares), limit
+        )
 
     @property
     def _beside(self) -> Floats:
@@ -545,9 +547,9 @@ class AnatomyTask(_PaintedTask):
             **{t: own for t, own in kept.items() if own.any()},
         }
 
-    def truth(self, facts: Facts) -> tuple[Tensor, Tensor]:
+    def truth(self, ground_truth: GroundTruth) -> tuple[Tensor, Tensor]:
         """See :meth:`Task.truth`."""
-        patient = dict(zip(facts.tissues, facts.values_hu, strict=True))[self.patient]
+        patient = dict(zip(ground_truth.tissues, ground_truth.values_hu, strict=True))[self.patient]
         present, absent = self._hu(patient)
         return torch.from_numpy(present).float(), torch.from_numpy(absent).float()
 

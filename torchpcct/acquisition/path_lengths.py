@@ -3,7 +3,7 @@ reading.
 
 A tissue is a body WITHOUT what lies inside it, so the tissues of a scene are disjoint and their
 path lengths add up to the chord of the outermost body. They are the columns of the linear model
-that the limit of :mod:`torchpcct.metrics.data_limit` rests on.
+that the limit of :mod:`torchpcct.metrics.cramer_rao` rests on.
 """
 
 from __future__ import annotations

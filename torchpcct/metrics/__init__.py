@@ -1,7 +1,7 @@
-"""Figures of merit: CNR, the limit of the data, observer, resolution, noise.
+"""Figures of merit: CNR, the Cramér–Rao bound, observer, resolution, noise.
 
 Reading order: ``placement`` and ``roi`` say where is measured, ``cnr`` is the paper's figure over
-realisations, ``data_limit`` the best that any unbiased method can reach. ``intervals`` gives
+realisations, ``cramer_rao`` the best that any unbiased method can reach. ``intervals`` gives
 figures theirs (bootstrap, jackknife), ``control`` narrows them. (What they are for, the dose
 factor, is :mod:`recon.evaluate`.) ``observer`` asks whether the core is seen, ``resolution`` and
 ``noise_power`` how sharp and how noisy an image is, and ``plaque_measures`` measures lumen, core
@@ -11,7 +11,7 @@ and resolution a real scan has, without a truth.
 
 from torchpcct.metrics.cnr import cnr, cnr_from_moments, cnr_interval, cnr_range, sd_interval
 from torchpcct.metrics.control import controlled_log_variance, controlled_mean
-from torchpcct.metrics.data_limit import ceiling, information_matrix
+from torchpcct.metrics.cramer_rao import cramer_rao_bound, information_matrix
 from torchpcct.metrics.intervals import Estimate, Jackknifed, combined
 from torchpcct.metrics.noise_power import NoisePower, noise_power_spectrum
 from torchpcct.metrics.observer import (
@@ -32,7 +32,6 @@ __all__ = [
     "NoisePower",
     "ResidualTest",
     "TransferFunction",
-    "ceiling",
     "channel_responses",
     "cnr",
     "cnr_from_moments",
@@ -41,6 +40,7 @@ __all__ = [
     "combined",
     "controlled_log_variance",
     "controlled_mean",
+    "cramer_rao_bound",
     "d_prime",
     "dog_channels",
     "edge_profile",

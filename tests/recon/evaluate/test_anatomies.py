@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from recon.evaluate.anatomies import ANATOMIES, TISSUES_HU, anatomy
 from recon.evaluate.names import TASKS
-from recon.evaluate.task import Facts
+from recon.evaluate.task import GroundTruth
 from recon.evaluate.tasks import AnatomyTask, read_task
 from recon.jobs.store import Store
 from torchpcct import Projector, VolumeGrid
@@ -111,10 +111,10 @@ def test_shares_are_those_of_the_labels_and_painting_is_their_mean():
 
 def test_what_the_task_of_an_anatomy_reads_is_its_truth(few):
     values = {**TISSUES_HU, "patient": -92.0, "signal": TISSUES_HU["calcium"]}
-    facts = Facts(tuple(few.shares), tuple(values[t] for t in few.shares), 1.0)
-    assert facts.tissues[:2] == ("signal", "lumen")
+    ground_truth = GroundTruth(tuple(few.shares), tuple(values[t] for t in few.shares), 1.0)
+    assert ground_truth.tissues[:2] == ("signal", "lumen")
     np.testing.assert_allclose(np.sum(list(few.shares.values()), axis=0), 1.0, atol=1e-12)
-    present, absent = (t.double().numpy() for t in few.truth(facts))
+    present, absent = (t.double().numpy() for t in few.truth(ground_truth))
     change = present - absent
     # What changes is the feature, in proportion to its share: calcium for wall or for fibrous
     # tissue.
@@ -136,14 +136,14 @@ def test_the_scan_of_an_anatomy_holds_what_is_painted(few, tmp_path):
     """By the projection of the true volume, whose voxels are twice as large as those that were
     projected."""
     store = Store(tmp_path)
-    facts = few.facts(store)
-    assert dict(zip(facts.tissues, facts.values_hu, strict=True))["signal"] == pytest.approx(
-        TISSUES_HU["calcium"]
-    )
-    assert facts.limit_hu > 0
+    ground_truth = few.ground_truth(store)
+    assert dict(zip(ground_truth.tissues, ground_truth.values_hu, strict=True))[
+        "signal"
+    ] == pytest.approx(TISSUES_HU["calcium"])
+    assert ground_truth.bound_hu > 0
     present, absent = few.scans(store)
     change = present.line_integrals() - absent.line_integrals()
-    truth = few.truth(facts)
+    truth = few.truth(ground_truth)
     mu = (truth[0] - truth[1]) * (present.linearisation.mu_ref / 1000.0)
     expected = Projector(present.geometry, few.grid, present.window)(mu)
     assert float(change.sum() / expected.sum()) == pytest.approx(1.0, abs=0.02)

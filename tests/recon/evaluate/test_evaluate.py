@@ -104,13 +104,13 @@ def test_ready_tasks_have_regions(name):
 
 def test_what_a_task_knows(task, found):
     (seen,) = found.results
-    values = dict(zip(seen.facts.tissues, seen.facts.values_hu, strict=True))
+    values = dict(zip(seen.ground_truth.tissues, seen.ground_truth.values_hu, strict=True))
     assert values["patient"] == pytest.approx(0.0, abs=1.0)
     assert 30.0 < values["signal"] < 70.0
     assert seen.true_hu["lesion"] == pytest.approx(-values["signal"] + values["patient"], abs=0.5)
     # Information grows with the exposure; the limit holds for one second.
     soft = value(found, "contrast SD at slope 1", "fbp:soft", "lesion")["value"]
-    assert seen.facts.limit_hu / math.sqrt(20.0) < soft
+    assert seen.ground_truth.bound_hu / math.sqrt(20.0) < soft
 
 
 def test_linear_methods_are_exact(found):
@@ -214,7 +214,7 @@ def test_a_false_contour_is_a_fall_of_the_mean_error_with_the_distance():
 
 def test_only_what_lies_away_from_edges_is_read_as_nothing(task, found):
     (seen,) = found.results
-    reader = Reader(task, task.truth(seen.facts))
+    reader = Reader(task, task.truth(seen.ground_truth))
     shares = np.max(list(task.shares.values()), axis=0)
     assert (shares[task.quiet.numpy()] > 1.0 - 1e-6).all()
     away = ndimage.distance_transform_edt(shares > 0.999, sampling=task.grid.spacing)
@@ -570,13 +570,13 @@ def test_a_segmented_lesion_is_a_task(voxel_task, task, folder, tmp_path):
         Store(tmp_path / "pieces"),
         Store(tmp_path / "analytic"),
     )
-    facts, known = mine.facts(store), task.facts(there)
-    assert facts.tissues == ("signal", "rim", "patient")
-    assert facts.values_hu[2] == pytest.approx(0.0, abs=1.0)
-    assert facts.limit_hu == pytest.approx(known.limit_hu, rel=0.4)
+    ground_truth, known = mine.ground_truth(store), task.ground_truth(there)
+    assert ground_truth.tissues == ("signal", "rim", "patient")
+    assert ground_truth.values_hu[2] == pytest.approx(0.0, abs=1.0)
+    assert ground_truth.bound_hu == pytest.approx(known.bound_hu, rel=0.4)
     present, absent = mine.scans(store)
     other = task.scans(there)
-    scale = known.contrast_hu / facts.contrast_hu
+    scale = known.contrast_hu / ground_truth.contrast_hu
     change = (present.line_integrals() - absent.line_integrals()) * scale
     exact = other[0].line_integrals() - other[1].line_integrals()
     # A column beside it would be 0.23; the staircase of the labels makes the sphere 1.3 % larger.
@@ -585,7 +585,7 @@ def test_a_segmented_lesion_is_a_task(voxel_task, task, folder, tmp_path):
     assert float(mine.shares["signal"].sum()) * 0.4**3 == pytest.approx(
         float((mine.labels == 7).sum()) * 0.1**3
     )
-    truth, without = mine.truth(facts)
+    truth, without = mine.truth(ground_truth)
     assert float(truth.max()) == pytest.approx(52.0)
     assert float(without.abs().max()) < 1.0
     assert float(mine.regions["lesion"][0].sum()) == pytest.approx(1.0)

@@ -779,7 +779,7 @@ def note(frame, event, what):
 sys.setprofile(note)
 task, methods = pickle.loads(Path(sys.argv[1]).read_bytes())
 draws = Draws(task, Store(Path(sys.argv[2])), 0, [k for m in methods for k in m.kernels])
-reader = Reader(task, task.truth(draws.facts))
+reader = Reader(task, task.truth(draws.ground_truth))
 for m in methods:
     Measurement(m, draws, reader, 20.0)
 sys.setprofile(None)

@@ -1,10 +1,10 @@
-"""What the data can give: the generalised least-squares limit for tissues of known shape and
-unknown attenuation.
+"""The Cramér–Rao bound, what the data can give: the limit of generalised least squares for tissues
+of known shape and unknown attenuation.
 
 With path-length maps ``a_i`` (one per tissue) and independent readings of variance ``1 / w`` the
 line integrals are ``y = Σ_i c_i a_i + noise``. The Gauss-Markov theorem: no unbiased linear
 estimate of any functional ``h·c`` has a variance below ``hᵀ F⁻¹ h`` with the information ``F_ij =
-<a_i, w a_j>``; for normal noise this is the Cramér-Rao limit, which binds every unbiased method,
+<a_i, w a_j>``; for normal noise this is the Cramér–Rao bound, which binds every unbiased method,
 linear or not. A reconstruction that must find the shapes knows less, so the limit holds for it as
 well; a figure beyond it is bias.
 
@@ -24,7 +24,7 @@ from torch import Tensor
 
 from torchpcct.validate import checked, number
 
-__all__ = ["ceiling", "information_matrix"]
+__all__ = ["cramer_rao_bound", "information_matrix"]
 
 Floats = NDArray[np.float64]
 
@@ -89,7 +89,7 @@ def information_matrix(
 
 
 @checked
-def ceiling(information: ArrayLike, functionals: ArrayLike) -> Floats:
+def cramer_rao_bound(information: ArrayLike, functionals: ArrayLike) -> Floats:
     """Smallest covariance of any unbiased estimate of linear functionals of the tissue amplitudes.
 
     Args:
