@@ -14,7 +14,15 @@ from torch import Tensor
 
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Beam, Geometry, ParallelBeam, VolumeGrid, beam
+from torchpcct.projector.cpu.symmetry import (
+    Orbits,
+    find_orbits,
+    inverse,
+    no_orbits,
+    place,
+)
 from torchpcct.projector.operator import apply_linear
+from torchpcct.projector.rays import rays_of
 from torchpcct.threads import run
 from torchpcct.validate import checked
 from torchpcct.vector_geometry import check_motion
@@ -34,6 +42,16 @@ rounding."""
 _FEWEST_ROWS = 8
 """Rows of a slab at least: products of a matrix with fewer rows are summed in another order by some
 libraries."""
+
+
+_LANES = 8
+"""Values that share positions and weights: a register of float32."""
+_SPARE = 17
+"""Places behind a row of one lane, or of eight, that are loaded and not used."""
+_BLOCK_BYTES = 128 << 10
+"""Sums of a task, which stay in the second-level cache."""
+_BLOCK_LINES = 16
+"""Lines of a task at most."""
 
 
 @functools.lru_cache(maxsize=64)
@@ -81,7 +99,7 @@ class BackprojectionPlan:
         self, geometry: Geometry, grid: VolumeGrid, window: DetectorWindow, motion: Any = None
     ) -> None:
         self.grid, self.window = grid, window
-        geometry = beam(geometry)
+        self.geometry = geometry = beam(geometry)
         self.cone, pitch = geometry.has_rows, geometry.column_pitch
         if isinstance(geometry, ParallelBeam):
             self.kind, self.sod, self.sdd = _KIND["parallel"], 0.0, 0.0
@@ -118,9 +136,10 @@ class BackprojectionPlan:
         of view."""
         self.radius = float(geometry.fov_radius)
         y, x = self.grid.axes[-2:]
-        outside = np.hypot(y[:, None], x[None, :]) + self.travel > self.radius * (1.0 + 1e-9)
-        if not outside.any():
+        limit = self.radius * (1.0 + 1e-9)
+        if np.hypot(np.abs(y).max(), np.abs(x).max()) + self.travel <= limit:
             return None
+        outside = np.hypot(y[:, None], x[None, :]) + self.travel > limit
         half_y, half_x = self.grid.extent[-2] / 2.0, self.grid.extent[-1] / 2.0
         cy, cx = self.grid.center[-2:]
         if abs(cy) > half_y or abs(cx) > half_x or outside.all():
@@ -267,11 +286,82 @@ class BackprojectionPlan:
                     out.numpy(),
                 )
             else:
-                tasks = len(out) * -(-out.shape[1] // kernels.ROWS)
-                run(kernels.backproject_2d, tasks, self.kind, numbers, *arguments, out.numpy())
+                self._plane(numbers, arguments, out.numpy())
             if self.mask is not None:
                 out.masked_fill_(torch.from_numpy(self.mask), 0.0)
         return out.view(*lead, *shape_out)
+
+    def _plane(self, data: NDArray, arguments: list[Any], out: NDArray) -> None:
+        """Slices ``data (B, V, columns)`` into ``out (B, Y, X)``: symmetric views of a slice, and
+        slices, are lanes that share positions and weights."""
+        from recon.analytic import backproject_kernels as kernels
+
+        orbits, (ny, nx) = self._orbits, self.grid.shape
+        operations = len(orbits.operations)
+        images = max(1, min(len(data), _LANES // operations))
+        lanes = 1 << (images * operations - 1).bit_length()
+        groups, views = -(-len(data) // images), orbits.views.size
+        poses = [np.ascontiguousarray(values[orbits.views]) for values in arguments[:4]]
+        columns, first = self.window.columns, np.zeros(self.window.views, dtype=np.int64)
+        if operations > 1:  # what symmetric views share refers to the whole detector
+            columns, first = self.geometry.columns, self.window.first_column
+            poses[-1] = poses[-1] + first[orbits.views]
+        rows = np.empty((groups, views, columns * lanes + _SPARE), dtype=data.dtype)
+        run(
+            kernels.interleave_lanes,
+            groups * views,
+            data,
+            first,
+            orbits.target,
+            orbits.reverse,
+            images,
+            columns,
+            lanes,
+            rows,
+            operations=columns * lanes,
+        )
+        block = max(1, min(_BLOCK_BYTES // (nx * lanes * data.itemsize), _BLOCK_LINES))
+        sums = np.empty((groups, ny, nx * lanes), dtype=data.dtype)
+        run(
+            kernels.backproject_2d,
+            groups * -(-ny // block),
+            (0,) * lanes,
+            self.kind,
+            rows,
+            *poses,
+            *arguments[4:],
+            columns,
+            block,
+            self._inside(),
+            sums,
+        )
+        run(
+            kernels.collect_lanes,
+            len(data) * -(-ny // kernels.TILE),
+            sums.reshape(groups, ny, nx, lanes),
+            np.array([inverse(g, ny, nx) for g in orbits.operations]),
+            images,
+            out,
+            operations=kernels.TILE * nx * operations,
+        )
+
+    @functools.cached_property
+    def _orbits(self) -> Orbits:
+        """Of a slice: which views share positions and weights."""
+        rays = rays_of(self.geometry)
+        found = find_orbits(self.geometry, self.grid, rays, bool(self.shifts.any()))
+        placed = place(found.operations, self.grid)
+        return no_orbits(rays.views) if placed.apart or placed.shift.any() else found
+
+    def _inside(self) -> NDArray[np.int64]:
+        """Of a slice: ``(Y, 2)``, the first pixel of each line that some view sees, and the one
+        after the last."""
+        ny, nx = self.grid.shape
+        if self.mask is None:
+            return np.tile([0, nx], (ny, 1))
+        seen: NDArray[np.bool_] = np.logical_not(self.mask)
+        first, last = seen.argmax(axis=1), nx - seen[:, ::-1].argmax(axis=1)
+        return np.where(seen.any(axis=1)[:, None], np.stack([first, last], axis=1), 0)
 
     def transpose(self, volume: Tensor) -> Tensor:
         """``(..., [z,] y, x)`` to ``(..., views, [rows,] columns)``: the exact transpose of

@@ -18,14 +18,17 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from torchpcct.kernel_cache import forget_outdated
+from torchpcct.projector.cpu.simd_interpolation import add_between
+
 PARALLEL = 0
 """Kind of a parallel beam."""
 FLAT = 1
 """Kind of a divergent beam on a flat detector."""
 CURVED = 2
 """Kind of a divergent beam on a curved detector."""
-ROWS = 16
-"""Rows of a task of :func:`backproject_2d`."""
+TILE = 32
+"""Pixels of the edge of a tile of :func:`collect_lanes`."""
 
 # No "nnan" or "ninf": NaN and Inf of the data must reach the image.
 _FAST = {"contract", "nsz", "arcp"}
@@ -74,33 +77,78 @@ def _positions_2d(
 
 
 @njit(**_OPTIONS)
-def backproject_2d(
-    begin, end, kind, data, cosines, sines, shifts, starts, x, y, sod, sdd, scale, atan, out
-):
-    """``data (B, V, columns)`` into ``out (B, Y, X)``."""
-    _, views, columns = data.shape
-    ny, nx = out.shape[1], out.shape[2]
-    number = data.dtype.type
-    block = ROWS
-    blocks = (ny + block - 1) // block
+def interleave_lanes(begin, end, data, first, target, reverse, images, columns, lanes, rows):
+    """``data (B, V, width)`` into ``rows (groups, views, ≥ (columns + 1) * lanes)``, by group and
+    projected view.
+
+    Lane ``operation + n * operations`` of group g holds view ``target[v, operation]`` of image ``g
+    * images + n`` from column ``first`` of that view on, all columns backwards where ``reverse``.
+    All else is 0, also the place after the last column, which is read with weight 0 at that
+    column's centre.
+    """
+    batch, _, width = data.shape
+    views, operations = target.shape
     for task in range(begin, end):
-        b, first = task // blocks, (task % blocks) * block
+        group, v = task // views, task % views
+        line = rows[group, v]
+        line[:] = 0
+        for l in range(images * operations):
+            n, to = group * images + l // operations, target[v, l % operations]
+            if n < batch and to >= 0:
+                source, start, step = data[n, to], first[to], 1
+                if reverse[v, l % operations]:
+                    start, step = columns - 1 - start, -1
+                for i in range(width):
+                    line[(start + step * i) * lanes + l] = source[i]
+
+
+@njit(**_OPTIONS)
+def backproject_2d(
+    begin,
+    end,
+    lanes,
+    kind,
+    rows,
+    cosines,
+    sines,
+    shifts,
+    starts,
+    x,
+    y,
+    sod,
+    sdd,
+    scale,
+    atan,
+    columns,
+    block,
+    inside,
+    out,
+):
+    """``rows (groups, V, ≥ (columns + 1) * lanes)`` into ``out (groups, Y, X * lanes)``, by blocks
+    of ``block`` lines.
+
+    ``inside (Y, 2)``: first pixel of every line that is wanted, and the one after the last.
+    """
+    width = len(lanes)
+    views, size = rows.shape[1], rows.shape[2] // width
+    ny, nx = y.size, x.size
+    number = rows.dtype.type
+    blocks = (ny + block - 1) // block
+    index = np.empty(nx, np.int32)
+    near, far = np.empty(nx, rows.dtype), np.empty(nx, rows.dtype)
+    xs = np.empty(nx, rows.dtype)
+    for i in range(nx):
+        xs[i] = number(x[i])
+    for task in range(begin, end):
+        group, first = task // blocks, (task % blocks) * block
         stop = min(first + block, ny)
-        total = np.zeros((block, nx), data.dtype)
-        index = np.empty(nx, np.int32)
-        near, far = np.empty(nx, data.dtype), np.empty(nx, data.dtype)
-        row = np.empty(columns + 1, data.dtype)
-        xs = np.empty(nx, data.dtype)
-        for i in range(nx):
-            xs[i] = number(x[i])
+        out[group, first:stop] = number(0)
         for v in range(views):
-            for i in range(columns):
-                row[i] = data[b, v, i]
-            row[columns] = number(0)  # read with weight 0 at the last column's centre
             for iy in range(first, stop):
+                i0, i1 = inside[iy, 0], inside[iy, 1]
                 _positions_2d(
                     kind,
-                    xs,
+                    xs[i0:i1],
                     y[iy],
                     cosines[v],
                     sines[v],
@@ -116,13 +164,44 @@ def backproject_2d(
                     near,
                     far,
                 )
-                line = total[iy - first]
-                for i in range(nx):
-                    k = np.uint32(index[i])
-                    line[i] += near[i] * row[k] + far[i] * row[k + np.uint32(1)]
-        for iy in range(first, stop):
-            for i in range(nx):
-                out[b, iy, i] = total[iy - first, i]
+                add_between(
+                    lanes,
+                    near,
+                    far,
+                    index,
+                    rows[group, v],
+                    size,
+                    i1 - i0,
+                    out[group, iy, i0 * width :],
+                )
+
+
+@njit(**_OPTIONS)
+def collect_lanes(begin, end, lanes, inverse, images, out):
+    """Sum of the lanes ``lanes (groups, Y, X, lanes)`` at each pixel of ``out (B, Y, X)``, by
+    blocks of :data:`TILE` lines.
+
+    ``inverse (operations, 6)``: row and column of the operated image that show pixel (y, x), each
+    as base, per y, per x.
+    """
+    _, ny, nx = out.shape
+    operations = inverse.shape[0]
+    blocks = (ny + TILE - 1) // TILE
+    for task in range(begin, end):
+        b, y0 = task // blocks, (task % blocks) * TILE
+        y1 = min(y0 + TILE, ny)
+        group, n = b // images, b % images
+        image = out[b]
+        image[y0:y1] = 0
+        for x0 in range(0, nx, TILE):
+            x1 = min(x0 + TILE, nx)
+            for g in range(operations):
+                at, l = inverse[g], n * operations + g
+                for y in range(y0, y1):
+                    for x in range(x0, x1):
+                        row = at[0] + at[1] * y + at[2] * x
+                        column = at[3] + at[4] * y + at[5] * x
+                        image[y, x] += lanes[group, row, column, l]
 
 
 @njit(**_OPTIONS)
@@ -492,3 +571,6 @@ def spread_3d(
         for r in range(rows):
             for i in range(columns):
                 out[b, v, r, i] = slab[i, r]
+
+
+forget_outdated(__name__)

@@ -34,6 +34,15 @@ CASES: dict[str, tuple[Geometry, VolumeGrid]] = {
         VolumeGrid((5, 4), (1.0, 0.8), (1.4, -2.3)),
     ),
     "fan-covering": (FanBeam(full_turn(9), 50, 90, 11, 1.3, 0.3), VolumeGrid((9, 9), 1.5)),
+    # Views that symmetries of the grid map onto one another share positions and weights.
+    "parallel-symmetric": (
+        ParallelBeam(np.arange(8) * math.pi / 8, 14, 1.1),
+        VolumeGrid((6, 6), 1.0),
+    ),
+    "fan-symmetric": (FanBeam(full_turn(8), 50, 90, 18, 1.3), VolumeGrid((5, 5), 1.0)),
+    "fan-turned": (FanBeam(full_turn(8), 50, 90, 19, 1.3, 0.3), VolumeGrid((6, 6), 1.0)),
+    "fan-oblong": (FanBeam(full_turn(6), 50, 90, 18, 1.3, 0.0, "curved"), VolumeGrid((4, 7), 1.0)),
+    "fan-symmetric-covering": (FanBeam(full_turn(8), 50, 90, 11, 1.3), VolumeGrid((10, 10), 1.5)),
     "cone-flat": (
         ConeBeam(full_turn(7), 50, 90, 15, 6, (1.2, 1.6), (0.2, 0.1)),
         VolumeGrid((3, 4, 5), (0.9, 1.0, 1.1), (0.3, 1.4, -1.3)),
@@ -116,6 +125,32 @@ def test_transposes_are_exact(case):
     forward = dense(plan.forward, geometry.shape)
     transpose = dense(plan.transpose, grid.shape)
     torch.testing.assert_close(transpose, forward.T, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", ["parallel", "fan-curved-short", "fan-turned", "fan-symmetric"])
+def test_slices_of_a_batch_have_the_bits_of_one(name, dtype):
+    geometry, grid = CASES[name]
+    data = torch.randn((9, *geometry.shape), generator=torch.Generator().manual_seed(3)).to(dtype)
+    alone = torch.stack([backproject(d, geometry, grid) for d in data])
+    assert torch.equal(backproject(data, geometry, grid), alone)
+
+
+@pytest.mark.parametrize("pixel", [0.05, 0.9, 1.9, 4.0])
+@pytest.mark.parametrize("center", [(0.0, 0.0), (1.3, -2.1)])
+def test_columns_are_interpolated_in_single_precision_at_any_step(pixel, center):
+    """Few or many columns lie between neighbouring pixels, in rising and in falling order."""
+    grid = VolumeGrid((5, 21), pixel, center)
+    geometry = FanBeam(full_turn(8), 300, 500, 161, 1.0, 0.0, "curved")
+    window = DetectorWindow.full(geometry)
+    if pixel < 1.0:
+        window = footprint(geometry, grid, margin=1)
+    data = torch.randn(geometry.shape, generator=torch.Generator().manual_seed(4)).cumsum(1)
+    found = backproject(
+        DetectorWindow.full(geometry).crop(data[:, None], window)[:, 0], geometry, grid, window
+    )
+    exact = backproject(data.double(), geometry, grid)
+    torch.testing.assert_close(found.double(), exact, rtol=0, atol=2e-3)
 
 
 @pytest.mark.parametrize("name", ["parallel", "fan-curved-short", "cone-curved"])

@@ -18,7 +18,7 @@ from torchpcct.projector.cpu.plane_kernels import (
     spread_tasks,
     tabulate,
 )
-from torchpcct.projector.cpu.symmetry import Orbits, address, find_orbits, no_orbits, place
+from torchpcct.projector.cpu.symmetry import Orbits, address, find_orbits, inverse, no_orbits, place
 from torchpcct.projector.rays import Segments, slab_lattice
 from torchpcct.projector.tables import Tables
 from torchpcct.threads import run
@@ -115,7 +115,7 @@ class PlanePasses:
         self.offset, self.entries = np.ascontiguousarray(entries[:-1]), int(entries[-1])
         ny, nx = grid.shape
         self.addresses = np.array([address(g, ny, nx) for g in orbits.operations])
-        self.inverse = np.array([_inverse(a, ny, nx) for a in self.addresses])
+        self.inverse = np.array([inverse(g, ny, nx) for g in orbits.operations])
         self.lattice = slab_lattice(self.placement.center, self.placement.shape, grid.spacing[-2:])
         self._steepest = 0.0
         self._tables: dict[tuple[np.dtype, int], _LaneTables] = {}
@@ -267,17 +267,3 @@ class PlanePasses:
             here = slice(n * self.operations, (n + 1) * self.operations)
             table[here, 0], table[here, 1:] = first + n, self.addresses
         return table if axis == 0 else np.ascontiguousarray(table[:, [0, 1, 3, 2]])
-
-
-def _inverse(affine: NDArray[np.int64], ny: int, nx: int) -> NDArray[np.int64]:
-    """Row and column of the operated image that show pixel (y, x): two times (base, per y, per
-    x)."""
-    base, down, right = (int(v) for v in affine)
-    rows = np.arange(ny * nx).reshape(ny, nx)
-    index = (base + down * np.arange(ny)[:, None] + right * np.arange(nx)).ravel()
-    where = np.empty(ny * nx, dtype=np.int64)
-    where[index] = rows.ravel()
-    at = np.stack(np.divmod(where.reshape(ny, nx), nx))  # (2, y, x): operated row and column
-    per_y = at[:, 1, 0] - at[:, 0, 0] if ny > 1 else np.zeros(2, dtype=np.int64)
-    per_x = at[:, 0, 1] - at[:, 0, 0] if nx > 1 else np.zeros(2, dtype=np.int64)
-    return np.stack([at[:, 0, 0], per_y, per_x], axis=1).ravel()

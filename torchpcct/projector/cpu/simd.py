@@ -60,6 +60,13 @@ class _Code:
     def sub(self, a: Any, b: Any) -> Any:
         return self.b.fsub(a, b, flags=_FUSED)
 
+    def fused(self, a: Any, b: Any, c: Any) -> Any:
+        """``a * b + c``, rounded once where the machine can: the same in every kernel and width."""
+        count = "" if not isinstance(a.type, ir.VectorType) else f"v{a.type.count}"
+        name = f"llvm.fmuladd.{count}f{self.dtype.bitwidth}"
+        kind = ir.FunctionType(a.type, [a.type] * 3)
+        return self.b.call(cgutils.get_or_insert_function(self.b.module, kind, name), [a, b, c])
+
     def splat(self, value: Any, count: int) -> Any:
         """A scalar in all places of a vector."""
         undefined = ir.Constant(ir.VectorType(value.type, count), ir.Undefined)

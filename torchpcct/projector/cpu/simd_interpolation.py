@@ -1,15 +1,16 @@
-"""Linear interpolation at equally spaced positions, eight at a time, and the steps between them, as
-explicit SIMD.
+"""Linear interpolation, eight positions at a time, as explicit SIMD: at equally spaced positions
+the steps between them, and at the positions of a line of pixels.
 
-Row edges lie evenly along a line of voxels. Eight neighbours of them read at most 8 (16) knots when
-they lie less than one (two) knots apart: these are loaded whole and picked in registers, where AVX2
-has a permutation for it. Elsewhere, and for larger steps, each pair of knots is loaded on its own.
-The arithmetic is the same.
+Row edges lie evenly along a line of voxels, and columns nearly so along a line of pixels. Eight
+neighbours of them read at most 8 (16) knots when they lie less than one (two) knots apart: these
+are loaded whole and picked in registers, where AVX2 has a permutation for it. Elsewhere, and for
+larger steps, each pair of knots is loaded on its own. The arithmetic is the same.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from typing import Any
 
 from llvmlite import ir
@@ -53,6 +54,76 @@ def set_steps(typingctx, lanes, line, zeta0, step, last, size, out, count):
     return _written(write, lanes, line, zeta0, step, last, size, out, count)
 
 
+@intrinsic
+def add_between(typingctx, lanes, near, far, index, row, size, count, total):
+    """``total[i] += near[i] row[index[i]] + far[i] row[index[i] + 1]`` for i < count: places of W
+    lanes each.
+
+    ``index``: int32; that of neighbours in order, but for one by rounding. ``row``: ``size``
+    places; of one lane 17 at least, and 16 behind the last that is read.
+    """
+
+    def write(c, _, near, far, index, row, size, count, total):
+        rest = ir.Constant(c.index, 0)
+        if c.width == 1 and _picks(c):
+            rest = _add_eights(c, near, far, index, row, size, count, total)
+        with cgutils.for_range(c.b, count, start=rest) as loop:
+            _add_one(c, near, far, index, row, loop.index, total)
+
+    return _written(write, lanes, near, far, index, row, size, count, total)
+
+
+def _add_one(c: Any, near: Any, far: Any, index: Any, row: Any, i: Any, total: Any) -> None:
+    """``add_between`` at one place."""
+    k = c.b.zext(c.b.load(c.b.gep(index, [i])), c.index)
+    value = c.load(total, c.times(i, c.width), c.wide)
+    for weights, at in ((far, c.b.add(k, ir.Constant(c.index, 1))), (near, k)):
+        weight = c.splat(c.load(weights, i, c.real), c.width)
+        value = c.fused(weight, c.load(row, c.times(at, c.width), c.wide), value)
+    c.store(value, total, c.times(i, c.width))
+
+
+def _add_eights(
+    one: Any, near: Any, far: Any, index: Any, row: Any, size: Any, count: Any, total: Any
+) -> Any:
+    """``add_between`` at all whole eights of places with one lane; returns the first place left."""
+    c = copy(one)
+    c.width, c.wide = 8, ir.VectorType(c.real, 8)
+    integer = ir.IntType(32)
+    eights = c.b.sdiv(count, ir.Constant(c.index, 8))
+    with cgutils.for_range(c.b, eights) as loop:
+        i = c.times(loop.index, 8)
+        k = c.b.load(
+            c.b.bitcast(c.b.gep(index, [i]), ir.VectorType(integer, 8).as_pointer()), align=4
+        )
+        ends = [c.b.extract_element(k, ir.Constant(integer, at)) for at in (0, 7)]
+        falls = c.b.icmp_signed(">", *ends)
+        low, high = c.b.select(falls, ends[1], ends[0]), c.b.select(falls, ends[0], ends[1])
+        # one on either side, for neighbours that rounding puts out of order
+        low = c.b.sub(low, ir.Constant(integer, 1))
+        low = c.b.select(
+            c.b.icmp_signed("<", low, ir.Constant(integer, 0)), ir.Constant(integer, 0), low
+        )
+        fits = c.b.icmp_signed("<", c.b.sub(high, low), ir.Constant(integer, 15))
+        with c.b.if_else(fits) as (then, otherwise):
+            with then:
+                value = c.load(total, i, c.wide)
+                for weights, knots in zip(
+                    (far, near), _pick(c, row, size, k, 2, low)[::-1], strict=True
+                ):
+                    value = c.fused(c.load(weights, i, c.wide), knots, value)
+                c.store(value, total, i)
+            with otherwise, cgutils.for_range(c.b, ir.Constant(c.index, 8)) as each:
+                _add_one(one, near, far, index, row, c.b.add(i, each.index), total)
+    return c.times(eights, 8)
+
+
+def _picks(c: Any) -> bool:
+    """Whether knots can be picked in registers."""
+    features = c.context.codegen().magic_tuple()[2].split(",")
+    return c.dtype == types.float32 and "+avx2" in features
+
+
 class _Steps:
     """What a line rises by from each of evenly spaced positions to the next."""
 
@@ -65,8 +136,7 @@ class _Steps:
     def give(self, take: Callable[[Any, Any], None]) -> None:
         """Call ``take(W steps, index of the first)`` for all of them."""
         c, b = self.c, self.c.b
-        features = c.context.codegen().magic_tuple()[2]
-        if c.width != 8 or c.dtype != types.float32 or "+avx2" not in features.split(","):
+        if c.width != 8 or not _picks(c):
             self._run(self._one_by_one, take)
             return
         fits = [
@@ -140,11 +210,16 @@ class _Positions:
         return k, c.sub(zeta, c.b.sitofp(k, c.wide))
 
 
-def _pick(c: Any, line: Any, size: Any, k: Any, vectors: int) -> tuple[Any, Any]:
-    """Knots ``k`` and ``k + 1`` out of ``vectors`` registers of 8 knots that begin at the first."""
+def _pick(
+    c: Any, line: Any, size: Any, k: Any, vectors: int, lowest: Any = None
+) -> tuple[Any, Any]:
+    """Knots ``k`` and ``k + 1`` out of ``vectors`` registers of 8 knots that begin at ``lowest``,
+    by default the first of ``k``."""
     kind = ir.FunctionType(c.wide, [c.wide, k.type])
     permute = cgutils.get_or_insert_function(c.b.module, kind, "llvm.x86.avx2.permps")
-    base = c.b.sext(c.b.extract_element(k, ir.Constant(ir.IntType(32), 0)), c.index)
+    if lowest is None:
+        lowest = c.b.extract_element(k, ir.Constant(ir.IntType(32), 0))
+    base = c.b.sext(lowest, c.index)
     # the last load must not leave the line
     highest = c.b.sub(size, ir.Constant(c.index, 8 * vectors + 1))
     base = c.b.select(c.b.icmp_signed("<", base, highest), base, highest)

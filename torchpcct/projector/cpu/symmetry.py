@@ -162,16 +162,15 @@ def find_orbits(geometry: Geometry, grid: VolumeGrid, rays: Rays, windowed: bool
                 target[swap, lane], reverse[swap, lane] = other[swap], 1 - s
         if (target < 0).any():
             continue
-        seen = np.zeros(views, dtype=bool)
+        seen = [False] * views
         chosen = []
-        for v in range(views):
+        for v, row in enumerate(target.tolist()):
             if seen[v]:
                 continue
-            for lane in range(len(operations)):
-                if seen[target[v, lane]]:
+            for lane, to in enumerate(row):
+                if seen[to]:
                     target[v, lane] = -1
-                else:
-                    seen[target[v, lane]] = True
+                seen[to] = True
             chosen.append(v)
         placed = place(tuple(operations), grid)
         cost = len(chosen) * (_COST_APART if placed.apart else _COST)[len(operations)]
@@ -196,3 +195,15 @@ def address(operation: tuple[int, int], ny: int, nx: int) -> Ints:
     down = int(index[1, 0]) - base if index.shape[0] > 1 else 0
     right = int(index[0, 1]) - base if index.shape[1] > 1 else 0
     return np.array([base, down, right], dtype=np.int64)
+
+
+def inverse(operation: tuple[int, int], ny: int, nx: int) -> Ints:
+    """Row and column of the operated image that show pixel (y, x): two times (base, per y, per
+    x)."""
+    row, column = np.array([0, 1, 0]), np.array([0, 0, 1])
+    for _ in range(operation[0]):
+        row, column = np.array([nx - 1, 0, 0]) - column, row
+        ny, nx = nx, ny
+    if operation[1]:
+        row = np.array([ny - 1, 0, 0]) - row
+    return np.concatenate([row, column]).astype(np.int64)
