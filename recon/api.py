@@ -155,9 +155,9 @@ def reconstruct(
     Returns:
         A :class:`torchpcct.Volume` (a list of them for a sequence of scans), float32 HU; its
         ``report`` says how it was made: method, options, seconds, ``warnings``, how many
-        ``dead_readings`` were bridged, ``cells_mm`` of the detector as they are seen at the axis
-        ([z,] y, x), and for iterative methods iterations and residual. In mm⁻¹ if ``scan.unit``
-        says so.
+        ``dead_readings`` were interpolated, ``cells_mm`` of the detector as they are seen at the
+        axis ([z,] y, x), and for iterative methods iterations and residual. In mm⁻¹ if
+        ``scan.unit`` says so.
 
     Raises:
         ValueError: an unknown method, kernel or option value, a grid outside the field of view, a

@@ -68,7 +68,7 @@ __all__ = ["ScanSlices", "SlabPlan", "StackOptions", "plan_slabs", "reconstruct_
 _LOG = logging.getLogger(__name__)
 
 HALO = 8
-"""Rows read beside those that a slab needs: dead cells are found and bridged with their
+"""Rows read beside those that a slab needs: dead cells are found and interpolated with their
 neighbours' help."""
 _RESERVE = 150 * 10**6
 """Compiled kernels, and what filters work on (:data:`recon.analytic.filter_plan.CHUNK_BYTES`)."""
@@ -100,7 +100,7 @@ class Part(NamedTuple):
         scan: of a cone beam with ``HALO`` rows more on either side.
         own: where they stand in it.
         zeros, replaced, dead: how many of their readings registered nothing, are such as no object
-            can cause, and are bridged by their neighbours.
+            can cause, and are interpolated from their neighbours.
     """
 
     scan: Scan
@@ -195,7 +195,7 @@ class ScanSlices:
         scan, own = repair_defects(raw, cells, self.photon)[0], slice(first - low, stop - low)
         _give_back()
         if halo and scan.dead is not None:
-            self._check_bridged(scan.dead, own, low)
+            self._check_interpolated(scan.dead, own, low)
 
         def mine(values: Tensor) -> Tensor:
             return values.narrow(axis, own.start, stop - first)
@@ -228,14 +228,14 @@ class ScanSlices:
                 break
         self.cells = wrong_cells(np.concatenate(parts, 1), lost, self.photon, light)
 
-    def _check_bridged(self, dead: Tensor, own: slice, low: int) -> None:
-        """Whether the neighbours that bridge dead cells were read."""
+    def _check_interpolated(self, dead: Tensor, own: slice, low: int) -> None:
+        """Whether the neighbours that dead cells are interpolated from were read."""
         outer = float(dead.float().mean((1, 2)).max()) > MOST_DEAD
         for side, rows in (
             (low > 0, dead[:, : own.start + 1]),
             (low + dead.shape[1] < self.count, dead[:, own.stop - 1 :]),
         ):
-            # and no live reading on one side, from which the row itself would be bridged
+            # and no live reading on one side, from which the row itself would be interpolated
             lost = rows.all(1)
             ends = (
                 (lost.cummin(-1).values | lost.flip(-1).cummin(-1).values.flip(-1))
@@ -246,7 +246,8 @@ class ScanSlices:
         if outer:
             raise ValueError(
                 f"too many readings are dead near row {low + own.start}: slabs read {HALO} rows "
-                "beside their own, which do not bridge them; reconstruct the whole volume at once"
+                "beside their own, which do not suffice to interpolate them; reconstruct the whole "
+                "volume at once"
             )
 
     def identity(self) -> str:

@@ -2,8 +2,8 @@
 air, dead cells.
 
 Called by ``Scan.from_counts`` and ``Scan.from_line_integrals``. What a scan makes of its readings
-is here, too: weights, the bias of the logarithm, and :func:`bridge`, which interpolates dead
-readings from their neighbours, so that they do not spread over the image.
+is here, too: weights, the bias of the logarithm, and :func:`interpolate_dead`, which interpolates
+dead readings from their neighbours, so that they do not spread over the image.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from torchpcct.scan_grid import cells_at_axis
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.validate import number
 
-__all__ = ["bridge", "dispersion", "inverse_variance", "log_bias"]
+__all__ = ["dispersion", "interpolate_dead", "inverse_variance", "log_bias"]
 
 _PSEUDO_DEPTH = 5.0
 """Line integral through as much water as all columns see at the axis, where a scan is not in HU.
@@ -54,7 +54,7 @@ _TRANSFER_SIGMAS = 3.0
 MEDIAN_TO_SD = 1.4826
 """Standard deviation over median absolute deviation, of normal values."""
 _BLOCK = 2**20
-"""Readings that are bridged at a time, about."""
+"""Readings that are interpolated at a time, about."""
 MOST_DEAD = 0.25
 """Largest share of a view's readings that may be dead: beyond it the neighbours say too little."""
 
@@ -472,7 +472,7 @@ def _filtered(values: Tensor, axis: int, weights: tuple[int, ...]) -> Tensor:
     return out
 
 
-def bridge(lines: Tensor, dead: Tensor, rows: bool, most: float = MOST_DEAD) -> Tensor:
+def interpolate_dead(lines: Tensor, dead: Tensor, rows: bool, most: float = MOST_DEAD) -> Tensor:
     """Replace dead readings by linear interpolation between the nearest live ones.
 
     Along the columns of a row where live readings stand on both sides, else along the rows; beyond
@@ -483,7 +483,7 @@ def bridge(lines: Tensor, dead: Tensor, rows: bool, most: float = MOST_DEAD) -> 
         lines: ``(..., views, [rows,] columns)``.
         dead: bool of the same shape, or one that broadcasts to it.
         rows: whether the last axis but one is the detector's rows (cone beams), so that a lost row
-            can be bridged.
+            can be interpolated.
         most: largest share of a view's readings that may be dead; 1: any, as long as a reading is
             left.
 
@@ -501,8 +501,8 @@ def bridge(lines: Tensor, dead: Tensor, rows: bool, most: float = MOST_DEAD) -> 
         worst = torch.unravel_index(share.argmax(), share.shape)
         raise ValueError(
             f"{100 * float(share.max()):.0f} % of the readings of view {int(worst[-1])} are dead "
-            f"(NaN, Inf or masked), at most {100 * most:.0f} % can be bridged: leave bad views out "
-            "with geometry.select"
+            f"(NaN, Inf or masked), at most {100 * most:.0f} % can be interpolated: leave bad "
+            "views out with geometry.select"
         )
     if bool(dead.all()):
         raise ValueError("no live reading is left: the scan cannot be used")
@@ -519,25 +519,25 @@ def bridge(lines: Tensor, dead: Tensor, rows: bool, most: float = MOST_DEAD) -> 
         else max(1, _BLOCK * lines.shape[view] // max(lines.numel(), 1))
     )
     blocks = [
-        _bridged_along(torch.where(d, 0.0, v), d, across)
+        _interpolated_along(torch.where(d, 0.0, v), d, across)
         for v, d in zip(lines.split(step, split), dead.split(step, split), strict=True)
     ]
     values, left = (torch.cat(parts, split) for parts in zip(*blocks, strict=True))
-    return _bridged_along(values, left, ((view, True), (view, False)))[0]
+    return _interpolated_along(values, left, ((view, True), (view, False)))[0]
 
 
-def _bridged_along(
+def _interpolated_along(
     values: Tensor, dead: Tensor, axes: Sequence[tuple[int, bool]]
 ) -> tuple[Tensor, Tensor]:
-    """:func:`_bridged` along one axis after the other, until nothing is dead."""
+    """:func:`_interpolated` along one axis after the other, until nothing is dead."""
     for axis, between in axes:
         if not bool(dead.any()):
             break
-        values, dead = _bridged(values, dead, axis, between)
+        values, dead = _interpolated(values, dead, axis, between)
     return values, dead
 
 
-def _bridged(values: Tensor, dead: Tensor, axis: int, between: bool) -> tuple[Tensor, Tensor]:
+def _interpolated(values: Tensor, dead: Tensor, axis: int, between: bool) -> tuple[Tensor, Tensor]:
     """Linear interpolation over the dead along one axis, and what stays dead.
 
     Args:

@@ -17,7 +17,15 @@ from torchpcct import counting_noise as noise
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.files import read_hdf5
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
-from torchpcct.readings import MANY, bridge, counted, inverse_variance, log_bias, logged, smoothed
+from torchpcct.readings import (
+    MANY,
+    counted,
+    interpolate_dead,
+    inverse_variance,
+    log_bias,
+    logged,
+    smoothed,
+)
 from torchpcct.scan_file import scan_fields, write_scan
 from torchpcct.scan_grid import grid_of
 from torchpcct.scanner.linearisation import WaterLinearisation
@@ -62,7 +70,7 @@ class Scan:
             add to every reading, whatever the exposure.
         flux: ``(views,)`` relative intensity of the source in each view; None: the same in all.
         dead: bool, the shape of ``counts``: readings that say nothing; None: there are none. They
-            are bridged by their neighbours in line integrals, and weigh nothing.
+            are interpolated from their neighbours in line integrals, and weigh nothing.
         logged: the readings come from given line integrals: their logarithm is taken as it is.
         unit: of volumes, "HU" or, where the attenuation of water is not known or means nothing,
             "mm^-1". "pixel^-1": the size of a cell is not known, all lengths are in cells.
@@ -472,7 +480,7 @@ class Scan:
         if not (self.noise_free or self.logged) and self.electronic_noise == 0.0:
             self._unbias(p)
         p = self.linearisation.apply(p, self.window)
-        return p if self.dead is None else bridge(p, self.dead, self.geometry.has_rows)
+        return p if self.dead is None else interpolate_dead(p, self.dead, self.geometry.has_rows)
 
     def _unbias(self, p: Tensor) -> None:
         """Add to ``p``, in place, what few counts leave of the logarithm's bias."""

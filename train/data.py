@@ -1,4 +1,4 @@
-"""Training data without a projector in the loop: random scenes, and the statistic AᵀW y drawn
+"""Training data without a projector in the loop: random scenes, and the right-hand side AᵀW y drawn
 through Gram operators.
 
 For a scene x and an exposure, β = H x + noise of covariance H is distributed as AᵀW y of a scan (up

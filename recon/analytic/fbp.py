@@ -26,7 +26,7 @@ from torchpcct.angles import view_steps
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import Beam, Geometry, VolumeGrid, beam, view_step
 from torchpcct.projector.operator import apply_linear
-from torchpcct.readings import bridge
+from torchpcct.readings import interpolate_dead
 from torchpcct.validate import checked, number, reals
 from torchpcct.vector_geometry import VectorGeometry
 
@@ -200,8 +200,8 @@ def fbp(
 
     Args:
         sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64. NaN and Inf
-            are dead readings: they are bridged by their neighbours
-            (:func:`torchpcct.readings.bridge`) with a warning.
+            are dead readings: they are interpolated from their neighbours
+            (:func:`torchpcct.readings.interpolate_dead`) with a warning.
         geometry: parallel, fan or cone beam; a closed circle, a short scan (at least π plus the fan
             angle), views in any order, irregularly spaced or repeated; or a
             :class:`~torchpcct.vector_geometry.VectorGeometry` that is nearly so
@@ -504,11 +504,11 @@ def _without_dead(sinogram: Tensor, geometry: Geometry) -> Tensor:
     dead = ~torch.isfinite(sinogram.detach())
     warnings.warn(
         f"{int(dead.sum())} of {dead.numel()} readings are NaN or Inf: they are taken for dead and "
-        "bridged by their neighbours",
+        "interpolated from their neighbours",
         UserWarning,
         stacklevel=4,
     )
-    return bridge(sinogram, dead, geometry.has_rows)
+    return interpolate_dead(sinogram, dead, geometry.has_rows)
 
 
 def _cut_sides(

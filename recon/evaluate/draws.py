@@ -25,7 +25,7 @@ from recon.analytic.exact_noise import roi_covariance
 from recon.analytic.inset import InsetFbp
 from recon.data_term import Quadratic
 from recon.evaluate.methods import Method, noise_of
-from recon.evaluate.response import response, statistic_covariance
+from recon.evaluate.response import response, right_hand_side_covariance
 from recon.evaluate.task import GroundTruth, Task
 from recon.jobs.store import Store
 from recon.least_squares.inset_problem import InsetProblem
@@ -129,7 +129,7 @@ class Draws:
         of what they give."""
         both = [self.noise_free(p, exposure_s).term for p in (True, False)]
         g = response(network, self.problem, reader.weights, both[0], exposure_s)
-        covariance = statistic_covariance(self.problem, g, exposure_s, self.clean[0])
+        covariance = right_hand_side_covariance(self.problem, g, exposure_s, self.clean[0])
         rois = len(g) // 2
         mean = np.stack(
             [torch.einsum("zyx,rzyx->r", t.b[0].double(), g).numpy().reshape(rois, 2) for t in both]

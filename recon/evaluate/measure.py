@@ -400,8 +400,8 @@ def _of(
     return found if first is None else {**found, "first": first}
 
 
-def functionals(adjoints: Tensor, statistic: Tensor) -> Floats:
+def functionals(adjoints: Tensor, right_hand_side: Tensor) -> Floats:
     """Of AᵀWy ``(z, y, x)``: ``(rois, 2)`` HU, of adjoints ``(2 · rois, z, y, x)``."""
-    return np.asarray(torch.einsum("zyx,rzyx->r", statistic.double(), adjoints).numpy()).reshape(
-        -1, 2
-    )
+    return np.asarray(
+        torch.einsum("zyx,rzyx->r", right_hand_side.double(), adjoints).numpy()
+    ).reshape(-1, 2)

@@ -64,7 +64,7 @@ def response(
     return g
 
 
-def statistic_covariance(
+def right_hand_side_covariance(
     problem: InsetProblem, g: Tensor, exposure_s: float, clean: Scan
 ) -> NDArray[np.float64]:
     """gᵢᵀ Cov(b) gⱼ of functionals ``(m, z, y, x)`` of b = AᵀW y with the weights of an exposure,

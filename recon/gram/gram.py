@@ -334,8 +334,8 @@ class Gram:
         """Draw AᵀW n for counting noise n ~ N(0, W⁻¹) without a projector: covariance G (stationary
         part).
 
-        So ``apply(x) + noise(...)`` is a draw of the sufficient statistic AᵀW y of a noisy scan of
-        x.
+        So ``apply(x) + noise(...)`` is a realisation of the right-hand side AᵀW y of a noisy scan
+        of x.
 
         Args:
             batch: leading shape of the result.
@@ -472,8 +472,8 @@ def _wrap(kernel: Tensor, period: int, axis: int) -> Tensor:
     gap = period - (2 * n - 1)
     if gap:
         t = torch.arange(1, gap + 1, dtype=kernel.dtype) / (gap + 1)
-        bridge = (1 - t) * kernel[..., -1:] + t * kernel[..., :1]
-        ring = torch.cat([positive, bridge, negative], dim=-1)
+        between = (1 - t) * kernel[..., -1:] + t * kernel[..., :1]
+        ring = torch.cat([positive, between, negative], dim=-1)
     else:
         ring = torch.cat([positive, negative], dim=-1)
     return ring.movedim(-1, axis)

@@ -194,8 +194,8 @@ class InsetProblem:
         if self._background is None:
             return self.outer.crop(scan.line_integrals(), self.window)
         require_same_surround(scan, self._background)
-        # The logarithm is taken of the footprint alone; the bridge over dead readings needs their
-        # neighbours.
+        # The logarithm is taken of the footprint alone; the interpolation of dead readings needs
+        # their neighbours.
         near = scan if scan.dead is not None or scan.window is None else scan.crop(self.window)
         lines = near.line_integrals()
         if near is scan:
@@ -259,7 +259,7 @@ class InsetProblem:
 
         The variances are those of the counts that the volume itself predicts. ``data`` is
         :meth:`data` of the scan, where it is at hand already. Raises ``ValueError`` for a
-        noise-free scan, which no statistic describes.
+        noise-free scan, which no right-hand side describes.
         """
         from torchpcct.metrics.residual_test import residual_test  # loads scipy.stats
 

@@ -15,8 +15,8 @@ from torchpcct.memory import free_bytes
 from torchpcct.validate import whole
 
 VOLUMES = 21
-"""Arrays of one volume's size that live at once: statistic, volume, gradients, two steps with their
-images, the prior's and the transform's temporaries, the spectra of a whole field."""
+"""Arrays of one volume's size that live at once: right-hand side, volume, gradients, two steps with
+their images, the prior's and the transform's temporaries, the spectra of a whole field."""
 SINOGRAMS = 3
 """Arrays of the data's size besides the arguments: weighted data, projection, their product."""
 

@@ -76,19 +76,19 @@ def image(grid, contrast, samples=5, hard=0.0, cores=(0.0,), **values):
 
 
 def operator(shape=(26, 24, 24), voxel=0.3):
-    """Gram operator of a scan in which a core stands out of the noise; its ``statistic`` takes
-    ``finer`` voxels."""
+    """Gram operator of a scan in which a core stands out of the noise; its ``right_hand_side``
+    takes ``finer`` voxels."""
     A, w = problem(views=120, shape=shape, voxel=voxel, rows=32)
     gram = Gram(A, w, 5).scaled(200.0)
     gram.finer = VolumeGrid(tuple(2 * n for n in shape), voxel / 2, A.grid.center)
     fine = Projector(A.geometry, gram.finer, A.window)
-    gram.statistic = lambda volume: A.T(200.0 * w * fine(volume))
+    gram.right_hand_side = lambda volume: A.T(200.0 * w * fine(volume))
     return gram
 
 
 def data(gram, volume, seed=None):
     """The data term of a volume on ``gram.finer``, in HU; noise of the operator for a seed."""
-    b = HU * gram.statistic(volume)
+    b = HU * gram.right_hand_side(volume)
     if seed is not None:
         b = b + gram.noise(generator=torch.Generator().manual_seed(seed))
     term = Quadratic(gram, b[None], torch.ones(1), gram.grid.spacing, 1000.0 * HU)
@@ -101,11 +101,11 @@ def inset():
     return SimpleNamespace(gram=gram, grid=gram.grid, mu_ref=1000.0 * HU, level=910.0 * HU)
 
 
-def statistic(drawn, seen, seed, exposure_s=1.0):
+def right_hand_side(drawn, seen, seed, exposure_s=1.0):
     """The data term of HU on ``gram.finer`` in an :func:`inset`; noise of a seed, None: without
     noise."""
     noise = 0.0 if seed is None else drawn.gram.noise(generator=torch.Generator().manual_seed(seed))
-    clean = drawn.gram.statistic((seen / 1000.0 + 1.0) * drawn.mu_ref - drawn.level)
+    clean = drawn.gram.right_hand_side((seen / 1000.0 + 1.0) * drawn.mu_ref - drawn.level)
     b = (exposure_s * clean + exposure_s**0.5 * noise)[None]
     return term_of(drawn, b, exposure_s)
 

@@ -1,7 +1,7 @@
 """Does a scan contradict itself? What its readings say, without a volume, and what no object can
 have caused.
 
-:mod:`~.defects` finds readings that no object can cause and bridges them (``repair_defects``).
+:mod:`~.defects` finds readings that no object can cause and interpolates them (``repair_defects``).
 :mod:`~.readings` finds readings that are not what they are described as (``reading_warnings``).
 :mod:`~.conjugate_rays` (``geometry_test``) and :mod:`~.moments` (``moment_test``) test the
 description of the geometry, of full and of half turns; :mod:`~.rotation_axis` measures where the

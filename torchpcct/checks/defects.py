@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpcct.readings import MEDIAN_TO_SD, MOST_DEAD, bridge, dispersion
+from torchpcct.readings import MEDIAN_TO_SD, MOST_DEAD, dispersion, interpolate_dead
 from torchpcct.scan import Scan
 from torchpcct.threads import run
 from torchpcct.validate import shaped
@@ -294,8 +294,8 @@ def _alone(
 
     The outline of a body that is round about the axis stays on its cells, too, and on others in
     every row: many of the cells about one of its own deviate, and so does one on the other side.
-    Gains are gone once their cells are bridged: those beside them then lie on a line with the next.
-    An outline bends the row wherever it is bridged.
+    Gains are gone once their cells are interpolated: those beside them then lie on a line with the
+    next. An outline bends the row wherever it is interpolated.
 
     Args:
         deviation: how far cells lie above the mean of their neighbours in the row.
@@ -565,7 +565,7 @@ def photon_and_light(scan: Scan) -> tuple[float, float]:
 def repair_defects(
     scan: Scan, cells: Cells | None = None, photon: float | None = None
 ) -> tuple[Scan, list[str]]:
-    """A scan whose impossible readings are bridged by their neighbours, and what was done.
+    """A scan whose impossible readings are interpolated from their neighbours, and what was done.
 
     Of a scan without window they are dead from then on (``scan.dead``): they weigh nothing. In
     views of which more is lost than :data:`torchpcct.readings.MOST_DEAD`, and in scans with a
@@ -620,7 +620,7 @@ def repair_defects(
     dead = mask if scan.dead is None else mask | scan.dead
     p = replace(scan, dead=dead)._logarithm()
     # Dead readings stand as 1 in p.
-    replaced = p.sub_(bridge(p, dead, rows=g.has_rows, most=1.0)).exp_()
+    replaced = p.sub_(interpolate_dead(p, dead, rows=g.has_rows, most=1.0)).exp_()
     replaced.sub_(0.5 * (1.0 if scan.quantum is None else scan.quantum)).clamp_min_(0.0)
     changes: dict[str, Any] = {"counts": torch.where(mask, replaced, scan.counts)}
     if window is None:
@@ -636,6 +636,7 @@ def repair_defects(
 
 
 def dead_readings(scan: Scan) -> int:
-    """How many readings of a scan are bridged by their neighbours, after :func:`repair_defects`."""
+    """How many readings of a scan are interpolated from their neighbours, after
+    :func:`repair_defects`."""
     known = 0 if scan.dead is None else int(scan.dead.sum())
     return max(known, int(scan.info.get("dead_readings", 0)))

@@ -45,5 +45,6 @@ def check_lines(lines: Tensor, shape: tuple[int, ...], fits: bool = True) -> Non
         raise ValueError(f"lines must have the shape {shape}, got {tuple(lines.shape)}")
     if not bool(torch.isfinite(lines).all()):
         raise ValueError(
-            "lines hold NaN or Inf: bridge dead readings before (torchpcct.readings.bridge)"
+            "lines hold NaN or Inf: interpolate dead readings before "
+            "(torchpcct.readings.interpolate_dead)"
         )

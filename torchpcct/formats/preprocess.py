@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchpcct.checks.defects import repair_defects
 from torchpcct.checks.rotation_axis import RotationAxis, at_axis, rotation_axis
-from torchpcct.readings import MEDIAN_TO_SD, bridge
+from torchpcct.readings import MEDIAN_TO_SD, interpolate_dead
 from torchpcct.scan import Scan
 from torchpcct.validate import checked
 
@@ -58,9 +58,9 @@ def cleaned(scan: Scan) -> Scan:
     """The same parallel or fan-beam scan without outliers and stripes (:func:`without_outliers`,
     :func:`without_stripes`).
 
-    Readings that no object can cause (:func:`torchpcct.checks.defects.repair_defects`) are bridged
-    before. The others are changed by the factor that their logarithms ask for, so that the scan
-    keeps its weights.
+    Readings that no object can cause (:func:`torchpcct.checks.defects.repair_defects`) are
+    interpolated before. The others are changed by the factor that their logarithms ask for, so that
+    the scan keeps its weights.
 
     Raises:
         ValueError: a cone beam, or a scan of a part of the detector.
@@ -74,7 +74,7 @@ def cleaned(scan: Scan) -> Scan:
     scan = repair_defects(scan)[0]
     lines = scan._logarithm()  # before the water correction, which belongs to the true readings
     if scan.dead is not None:
-        lines = bridge(lines, scan.dead, rows=False)
+        lines = interpolate_dead(lines, scan.dead, rows=False)
     corrected = without_stripes(without_outliers(lines))
     return replace(scan, counts=scan.counts * torch.exp(lines - corrected))
 

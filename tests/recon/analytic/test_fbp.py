@@ -250,9 +250,9 @@ def test_nan_and_inf_reach_the_filtered_rows_and_fbp_bridges_them(bad, columns):
     image = backproject(filter_sinogram(data, geometry), geometry, grid)
     assert not image[:, 1, 1].isfinite().any()
     with pytest.warns(UserWarning, match="1 of .* readings are NaN or Inf"):
-        bridged = fbp(data, geometry, grid, outside=0.0)
+        interpolated = fbp(data, geometry, grid, outside=0.0)
     torch.testing.assert_close(
-        bridged, fbp(torch.ones(geometry.shape), geometry, grid, outside=0.0)
+        interpolated, fbp(torch.ones(geometry.shape), geometry, grid, outside=0.0)
     )
 
 

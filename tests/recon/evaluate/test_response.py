@@ -8,7 +8,7 @@ import pytest
 import torch
 from inset_operators import HU, problem, term_of, tissue
 
-from recon.evaluate.response import response, statistic_covariance
+from recon.evaluate.response import response, right_hand_side_covariance
 from recon.gram.gram import Gram
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import NetworkConfig
@@ -94,9 +94,9 @@ def test_covariance_is_that_of_projections(inset, weights, monkeypatch):
     inner = SimpleNamespace(
         weights=p.weights, projector=p.projector, outer="w", geometry="g", window="w"
     )
-    found = statistic_covariance(inner, weights, DOSE, clean)
+    found = right_hand_side_covariance(inner, weights, DOSE, clean)
     rows = [p.projector(w) * p.weights * DOSE for w in weights]
     expected = [[float((a * b * variance / DOSE).sum()) for b in rows] for a in rows]
     np.testing.assert_allclose(found, expected, rtol=1e-10)
     with pytest.raises(ValueError, match="another geometry or window"):
-        statistic_covariance(inner, weights, DOSE, SimpleNamespace(window="x", geometry="g"))
+        right_hand_side_covariance(inner, weights, DOSE, SimpleNamespace(window="x", geometry="g"))

@@ -146,7 +146,7 @@ def test_report_and_callback(inset):
     assert result.report["strength"] == EDGE.strength
 
 
-def test_from_the_sufficient_statistic(inset):
+def test_from_the_right_hand_side(inset):
     """The problem of the model, without a projector, is close to the exact one."""
     A, w, gram, y = inset
     b = A.T(w * y)

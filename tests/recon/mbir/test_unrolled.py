@@ -20,7 +20,7 @@ SHAPE = (8, 12, 12)
 
 @pytest.fixture(scope="module")
 def scan():
-    """Gram operator of a small inset (0.4 mm), a tissue, and its noise-free statistic."""
+    """Gram operator of a small inset (0.4 mm), a tissue, and its noise-free right-hand side."""
     A, w = problem(shape=SHAPE, rows=10)
     gram = Gram(A, w, nodes=1)
     x = tissue(A.grid)
@@ -165,7 +165,7 @@ def test_noise_levels_of_the_training_are_kept(scan):
 @pytest.mark.parametrize("size", [0.0, 1e-12, 1e6])
 def test_extreme_data_stay_in_proportion(scan, size):
     """Homogeneous of degree one at a given noise scale: from nothing to a million times the
-    statistic."""
+    right-hand side."""
     net, p = model(), normal(scan, noise=1.0)
     scaled = replace(p, b=p.b * size)
     found, expected = net(scaled), net(p) * size

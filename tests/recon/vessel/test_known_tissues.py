@@ -7,7 +7,7 @@ import drawn_vessel
 import numpy as np
 import pytest
 import torch
-from drawn_vessel import statistic
+from drawn_vessel import right_hand_side
 from refusals import refused
 from small_scan import GRID
 
@@ -40,7 +40,7 @@ def truth(drawn):
 @pytest.fixture(scope="module")
 def solved(drawn, network, fine):
     """Without and with tissues, HU, and the notes."""
-    b = statistic(drawn, fine, 1)
+    b = right_hand_side(drawn, fine, 1)
     method = network.with_known(KnownTissues())
     (found,) = method.solve(b)
     with torch.no_grad():
@@ -70,7 +70,7 @@ def test_what_no_tissue_is_comes_from_the_data(solved):
 def test_the_data_are_kept(drawn, network, solved, fine):
     """The low frequencies of the residual are as small as without tissues, the fit to the data
     is better."""
-    b = statistic(drawn, fine, 1)
+    b = right_hand_side(drawn, fine, 1)
     normal = network.normal(b)
     rest = []
     for volume in solved[:2]:
@@ -84,7 +84,7 @@ def test_the_data_are_kept(drawn, network, solved, fine):
 
 
 def test_without_a_vessel_it_is_the_plain_reconstruction(drawn, network):
-    b = statistic(drawn, torch.full(drawn.gram.finer.shape, -90.0), 2)
+    b = right_hand_side(drawn, torch.full(drawn.gram.finer.shape, -90.0), 2)
     (found,) = network.with_known(KnownTissues()).solve(b)
     assert torch.equal(found.volume, network(b)[0])
     assert not found.report["tissues"]["used"]
@@ -95,7 +95,7 @@ def test_without_a_vessel_it_is_the_plain_reconstruction(drawn, network):
 def test_tissues_that_do_not_explain_the_data_are_not_used(drawn, network, fine, monkeypatch):
     reading = known.read_plaque
     monkeypatch.setattr(known, "read_plaque", lambda *a, **k: replace(reading(*a, **k), chi2=2.0))
-    b = statistic(drawn, fine, 1)
+    b = right_hand_side(drawn, fine, 1)
     (found,) = network.with_known(KnownTissues()).solve(b)
     assert torch.equal(found.volume, network(b)[0])
     assert "residual is 2.00" in found.warnings[0]
@@ -109,7 +109,7 @@ def test_what_is_believed_of_the_vessel_reaches_the_reading(drawn, network, fine
         raise ValueError("seen")
 
     monkeypatch.setattr(known, "read_plaque", reading)
-    b = statistic(drawn, fine, 1)
+    b = right_hand_side(drawn, fine, 1)
     for believed in (None, VesselPrior(wall=(20.0, 5.0))):
         network.with_known(KnownTissues(believed)).with_fidelity(1.0).solve(b)
     assert seen == [None, VesselPrior(wall=(20.0, 5.0))]
@@ -117,7 +117,7 @@ def test_what_is_believed_of_the_vessel_reaches_the_reading(drawn, network, fine
 
 @pytest.mark.extended
 def test_a_core_is_drawn_as_far_as_it_is_probable(drawn, network, fine, monkeypatch):
-    b = statistic(drawn, fine, 1)
+    b = right_hand_side(drawn, fine, 1)
     reading = read_plaque(b)
     monkeypatch.setattr(
         known, "read_plaque", lambda *arguments, **settings: replace(reading, presence=0.25)
@@ -148,7 +148,7 @@ def test_another_fidelity_keeps_the_tissues_and_noise_units_are_the_inverse_of_h
     assert isinstance(method.known, KnownTissues)
     assert (method.fidelity, method.known.point) == (1.0, (0.0, 0.0, 1.0))
     assert network.fidelity != 1.0
-    normal = network.normal(statistic(drawn, fine, 1))
+    normal = network.normal(right_hand_side(drawn, fine, 1))
     back = normal.hu(normal.of_hu(truth[None]))
     assert torch.allclose(back[0], truth, atol=1e-3)
 

@@ -15,19 +15,19 @@ from recon.vessel.known import KnownVessel
 EXPOSURE_S = 0.25
 
 
-def statistic(drawn, image, seed):
-    return drawn_vessel.statistic(drawn, image, seed, EXPOSURE_S)
+def right_hand_side(drawn, image, seed):
+    return drawn_vessel.right_hand_side(drawn, image, seed, EXPOSURE_S)
 
 
 @pytest.fixture(scope="module")
 def vessel(drawn):
     """The data term of a vessel with a core of 100 HU of contrast, drawn on finer voxels."""
-    return statistic(drawn, drawn_vessel.image(drawn.gram.finer, 100.0, samples=3), 1)
+    return right_hand_side(drawn, drawn_vessel.image(drawn.gram.finer, 100.0, samples=3), 1)
 
 
 def test_outlines_are_sharper_and_the_layer_keeps_what_the_data_show(drawn, network):
     truth = drawn_vessel.image(drawn.grid, 100.0)
-    vessel = statistic(drawn, drawn_vessel.image(drawn.gram.finer, 100.0, samples=3), None)
+    vessel = right_hand_side(drawn, drawn_vessel.image(drawn.gram.finer, 100.0, samples=3), None)
     (found,) = network.with_known(KnownVessel()).solve(vessel)
     assert found.report["vessel"]["drawn"]
     plain, around = network(vessel)[0], found.volume
@@ -40,7 +40,7 @@ def test_outlines_are_sharper_and_the_layer_keeps_what_the_data_show(drawn, netw
 
 
 def test_without_a_vessel_it_is_the_plain_reconstruction(drawn, network):
-    b = statistic(drawn, torch.full(drawn.gram.finer.shape, -90.0), 2)
+    b = right_hand_side(drawn, torch.full(drawn.gram.finer.shape, -90.0), 2)
     (found,) = network.with_known(KnownVessel()).solve(b)
     assert torch.equal(found.volume, network(b)[0])
     assert "nothing stands out" in found.report["vessel"]["why"]
@@ -55,7 +55,7 @@ def test_outlines_that_leave_something_unexplained_are_not_drawn(drawn, network)
         torch.arange(n)[(slice(None),) + (None,) * (2 - k)] for k, n in enumerate(image.shape)
     )
     near = (z - bright[0]) ** 2 + (y - bright[1] - 12) ** 2 + (x - bright[2]) ** 2 < 36
-    b = statistic(drawn, torch.where(near, torch.tensor(900.0), image), 3)
+    b = right_hand_side(drawn, torch.where(near, torch.tensor(900.0), image), 3)
     (found,) = network.with_known(KnownVessel()).solve(b)
     assert not found.report["vessel"]["drawn"]
     assert torch.equal(found.volume, network(b)[0])
@@ -69,7 +69,7 @@ def test_what_lies_apart_from_a_vessel_does_not_speak_against_it(drawn, network)
     wall = drawn_vessel.INNER_MM + drawn_vessel.WALL_MM
     muscle = y - drawn_vessel.TILT * z[:, None] < -(wall + 1.2)
     beside = torch.where(muscle[:, :, None], torch.tensor(0.0), image)
-    b = statistic(drawn, beside, 3)
+    b = right_hand_side(drawn, beside, 3)
     (found,) = network.with_known(KnownVessel()).solve(b)
     assert found.report["vessel"]["drawn"], found.report
     volumes = found.volume, network(b)[0]
@@ -82,14 +82,14 @@ def test_what_lies_apart_from_a_vessel_does_not_speak_against_it(drawn, network)
 def test_a_vessel_of_what_is_no_tissue_is_not_drawn(drawn, network, values, tissue):
     """Inflamed fat about a lumen, contrast agent beside a flap: both are fitted, and explain the
     data."""
-    b = statistic(drawn, drawn_vessel.image(drawn.gram.finer, 0.0, samples=3, **values), 4)
+    b = right_hand_side(drawn, drawn_vessel.image(drawn.gram.finer, 0.0, samples=3, **values), 4)
     (found,) = network.with_known(KnownVessel()).solve(b)
     assert f"its {tissue}" in found.report["vessel"]["why"]
     assert torch.equal(found.volume, network(b)[0])
 
 
 def test_scenes_of_a_batch_are_what_they_are_alone(drawn, network, vessel):
-    empty = statistic(drawn, torch.full(drawn.gram.finer.shape, -90.0), 2)
+    empty = right_hand_side(drawn, torch.full(drawn.gram.finer.shape, -90.0), 2)
     method = network.with_known(KnownVessel())
     both = method.solve(Quadratic.joined([empty, vessel]))
     for k, alone in enumerate((empty, vessel)):
@@ -107,7 +107,7 @@ def test_it_is_differentiable_with_the_fit(drawn, network, vessel):
     method = network.with_known(KnownVessel()).with_fidelity(1.0)
     b = vessel.b.clone().requires_grad_()
     weights = torch.from_numpy(np.random.default_rng(0).standard_normal(b.shape)).float()
-    direction = statistic(drawn, torch.full(drawn.gram.finer.shape, -910.0), 5).b * 0.02
+    direction = right_hand_side(drawn, torch.full(drawn.gram.finer.shape, -910.0), 5).b * 0.02
 
     def weighed(b):
         return (method(replace(vessel, b=b)) * weights).sum(dtype=torch.float64)
@@ -124,7 +124,7 @@ def test_more_fidelity_leaves_more_of_the_contrast_and_of_the_noise(drawn, netwo
     contrast, noise = [], []
     for fidelity in (0.0, 1.0):
         clean, without, noisy = (
-            KnownVessel().drawn(statistic(drawn, image, seed), fidelity).image
+            KnownVessel().drawn(right_hand_side(drawn, image, seed), fidelity).image
             for image, seed in ((images[0], None), (images[1], None), (images[1], 7))
         )
         contrast.append(float((without - clean)[core].mean()))

@@ -1,5 +1,5 @@
 """Readings: wrong descriptions come out right, or are named, sound scans are not; dead ones are
-bridged exactly."""
+interpolated exactly."""
 
 import math
 import re
@@ -13,7 +13,7 @@ from recon import reconstruct
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, full_turn
 from torchpcct.checks.defects import repair_defects
 from torchpcct.checks.readings import reading_warnings
-from torchpcct.readings import bridge, log_bias, smoothed
+from torchpcct.readings import interpolate_dead, log_bias, smoothed
 
 MU = 0.02
 AIR = 1e5
@@ -163,17 +163,17 @@ def test_bridging_is_linear_and_knows_nothing_of_the_dead():
     dead[1, :, 4:6] = True
     dead[2, 1] = True  # a whole row
     broken = torch.where(dead, math.nan, ramp)
-    torch.testing.assert_close(bridge(broken, dead, rows=True), ramp)
+    torch.testing.assert_close(interpolate_dead(broken, dead, rows=True), ramp)
     edge = torch.where(torch.arange(9) < 2, math.inf, ramp[0])
     torch.testing.assert_close(
-        bridge(edge, torch.arange(9) < 2, rows=True)[:, :2], ramp[0, :, 2:3].expand(-1, 2)
+        interpolate_dead(edge, torch.arange(9) < 2, rows=True)[:, :2], ramp[0, :, 2:3].expand(-1, 2)
     )
     x = broken.double().requires_grad_()
-    (gradient,) = torch.autograd.grad(bridge(x, dead, rows=True).sum(), x)
+    (gradient,) = torch.autograd.grad(interpolate_dead(x, dead, rows=True).sum(), x)
     assert gradient[dead].abs().max() == 0
     assert float(gradient.sum()) == dead.numel()
     with pytest.raises(ValueError, match="100 % of the readings of view 2 are dead"):
-        bridge(ramp, (torch.arange(3) == 2)[:, None, None], rows=True)
+        interpolate_dead(ramp, (torch.arange(3) == 2)[:, None, None], rows=True)
 
 
 def test_lost_columns_rows_and_views_of_linear_data_come_back():
@@ -186,7 +186,7 @@ def test_lost_columns_rows_and_views_of_linear_data_come_back():
     mask = torch.zeros(lines.shape, dtype=torch.bool)
     mask[:, :, 4:6] = mask[3] = mask[:, 2] = True
     broken = torch.where(mask, 1e9, lines)
-    torch.testing.assert_close(bridge(broken, mask, rows=True, most=1.0), lines)
+    torch.testing.assert_close(interpolate_dead(broken, mask, rows=True, most=1.0), lines)
 
 
 def test_at_the_edge_the_other_axis_serves_and_then_the_nearest():
@@ -198,10 +198,12 @@ def test_at_the_edge_the_other_axis_serves_and_then_the_nearest():
     )
     mask = torch.zeros(lines.shape, dtype=torch.bool)
     mask[:, 2, 0] = True  # the rows beside it are alive
-    torch.testing.assert_close(bridge(lines.masked_fill(mask, 1e9), mask, rows=True), lines)
+    torch.testing.assert_close(
+        interpolate_dead(lines.masked_fill(mask, 1e9), mask, rows=True), lines
+    )
     mask[:, :, 0] = mask[0] = True
-    full = bridge(lines.masked_fill(mask, 1e9), mask, rows=True, most=1.0)
+    full = interpolate_dead(lines.masked_fill(mask, 1e9), mask, rows=True, most=1.0)
     torch.testing.assert_close(full[1:, :, 0], lines[1:, :, 1])
     torch.testing.assert_close(full[0, :, 1:], lines[1, :, 1:])
     with pytest.raises(ValueError, match="no live reading is left"):
-        bridge(lines, torch.ones_like(mask), rows=True, most=1.0)
+        interpolate_dead(lines, torch.ones_like(mask), rows=True, most=1.0)
