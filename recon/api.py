@@ -233,11 +233,11 @@ def _prepared(scan: Scan) -> tuple[Scan, list[str]]:
     """A scan with its readings repaired, and what they say against their description; the work of
     the first method on it."""
 
-    def look() -> tuple[Scan | None, list[str]]:
+    def inspect_readings() -> tuple[Scan | None, list[str]]:
         repaired, texts = repair_defects(scan)
         return None if repaired is scan else repaired, [*texts, *reading_warnings(repaired)]
 
-    repaired, texts = once(scan, "readings", look)
+    repaired, texts = once(scan, "readings", inspect_readings)
     return scan if repaired is None else repaired, texts
 
 

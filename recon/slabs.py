@@ -197,12 +197,14 @@ class ScanSlices:
         if halo and scan.dead is not None:
             self._check_interpolated(scan.dead, own, low)
 
-        def mine(values: Tensor) -> Tensor:
+        def own_part(values: Tensor) -> Tensor:
             return values.narrow(axis, own.start, stop - first)
 
-        replaced = 0 if scan is raw else int(torch.ne(mine(scan.counts), mine(raw.counts)).sum())
-        dead = replaced + (0 if raw.dead is None else int(mine(raw.dead).sum()))
-        return Part(scan, own, int((mine(raw.counts) <= 0).sum()), replaced, dead)
+        replaced = (
+            0 if scan is raw else int(torch.ne(own_part(scan.counts), own_part(raw.counts)).sum())
+        )
+        dead = replaced + (0 if raw.dead is None else int(own_part(raw.dead).sum()))
+        return Part(scan, own, int((own_part(raw.counts) <= 0).sum()), replaced, dead)
 
     def find_cells(self, step: int) -> None:
         """Find the cells of a cone beam that are dead or of a wrong gain, by all rows, ``step``
@@ -718,10 +720,10 @@ def _survey(source: ScanSlices, plan: SlabPlan) -> dict[str, Any]:
     sides = ends_cut_off(
         max(highest), torch.cat(first_column), torch.cat(last_column), beam(g), angular_weights(g)
     )
-    return {"sides": sides, "dead_readings": dead, **_looked_at(source, plan, replaced, sides)}
+    return {"sides": sides, "dead_readings": dead, **_test_middle(source, plan, replaced, sides)}
 
 
-def _looked_at(
+def _test_middle(
     source: ScanSlices, plan: SlabPlan, replaced: int, sides: tuple[bool, bool]
 ) -> dict[str, Any]:
     g, cone = source.geometry, source.geometry.has_rows

@@ -82,17 +82,17 @@ def draw(state: np.uint64) -> tuple[np.uint64, float]:
 
 
 @njit(inline="always", cache=True)
-def _normal_one(state: np.uint64) -> float:
+def _normal_variate(state: np.uint64) -> float:
     state, u = draw(state)
     state, v = draw(state)
     return math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * v)
 
 
 @njit(cache=True)
-def _poisson_one(mean: float, state: np.uint64) -> float:
+def _poisson_variate(mean: float, state: np.uint64) -> float:
     # Whole numbers stay floats: math.floor gives int64, which ends at 9e18.
     if mean >= _NORMAL:
-        return np.floor(mean + math.sqrt(mean) * _normal_one(state) + 0.5)
+        return np.floor(mean + math.sqrt(mean) * _normal_variate(state) + 0.5)
     if mean < 10.0:
         state, u = draw(state)
         p = math.exp(-mean)
@@ -125,14 +125,16 @@ def _poisson_one(mean: float, state: np.uint64) -> float:
 
 
 @njit(cache=True)
-def _binomial_one(n: float, p: float, state: np.uint64) -> float:
+def _binomial_variate(n: float, p: float, state: np.uint64) -> float:
     """Of ``n`` events those that happen, each with the probability ``p`` ≤ ½."""
     q = 1.0 - p
     ratio = p / q
     if n >= _NORMAL:
         if p < _RARE:
-            return min(_poisson_one(n * p, state), n)
-        return min(max(np.floor(n * p + math.sqrt(n * p * q) * _normal_one(state) + 0.5), 0.0), n)
+            return min(_poisson_variate(n * p, state), n)
+        return min(
+            max(np.floor(n * p + math.sqrt(n * p * q) * _normal_variate(state) + 0.5), 0.0), n
+        )
     if n * p < 10.0:
         state, u = draw(state)
         share = math.exp(n * math.log1p(-p))
@@ -183,9 +185,9 @@ def _thinned_rows(
             elif n <= 0.0:
                 out[i, j] = fraction * min(given, 0.0)
             elif fraction <= 0.5:
-                out[i, j] = _binomial_one(n, fraction, state)
+                out[i, j] = _binomial_variate(n, fraction, state)
             else:
-                out[i, j] = n - _binomial_one(n, 1.0 - fraction, state)
+                out[i, j] = n - _binomial_variate(n, 1.0 - fraction, state)
 
 
 @njit(nogil=True, cache=True)
@@ -198,10 +200,12 @@ def _split_rows(
             if not (0.0 <= n < math.inf and 0.0 <= p <= 1.0):
                 out[i, j] = np.nan
             elif p <= 0.5:
-                out[i, j] = 0.0 if n * p == 0.0 else _binomial_one(n, p, stream(key, first[i] + j))
+                out[i, j] = (
+                    0.0 if n * p == 0.0 else _binomial_variate(n, p, stream(key, first[i] + j))
+                )
             else:
                 out[i, j] = n - (
-                    0.0 if p == 1.0 else _binomial_one(n, 1.0 - p, stream(key, first[i] + j))
+                    0.0 if p == 1.0 else _binomial_variate(n, 1.0 - p, stream(key, first[i] + j))
                 )
 
 
@@ -213,7 +217,7 @@ def _poisson_rows(
         for j in range(mean.shape[1]):
             lam = np.float64(mean[i, j]) * scale
             if 0.0 < lam < math.inf:
-                out[i, j] = _poisson_one(lam, stream(key, first[i] + j))
+                out[i, j] = _poisson_variate(lam, stream(key, first[i] + j))
             elif lam == 0.0:
                 out[i, j] = 0.0
             else:
@@ -224,7 +228,7 @@ def _poisson_rows(
 def _normal_rows(begin: int, end: int, first: Ints, key: np.uint64, out: Reals) -> None:
     for i in range(begin, end):
         for j in range(out.shape[1]):
-            out[i, j] = _normal_one(stream(key, first[i] + j))
+            out[i, j] = _normal_variate(stream(key, first[i] + j))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -243,7 +247,7 @@ def _compound_rows(
             q = np.float64(quantum[i, j])
             lam = np.float64(mean[i, j]) * scale / q
             if 0.0 < lam < math.inf and q > 0.0:
-                out[i, j] = q * _poisson_one(lam, stream(key, first[i] + j))
+                out[i, j] = q * _poisson_variate(lam, stream(key, first[i] + j))
             elif lam == 0.0 and q > 0.0:
                 out[i, j] = 0.0
             else:

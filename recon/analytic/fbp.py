@@ -459,13 +459,13 @@ def _shape(sinogram: Tensor, layer: int) -> Tensor:
     schema="(Tensor sinogram, Tensor gradient, int layer) -> Tensor",
 )
 def _traced_gradient(sinogram: Tensor, gradient: Tensor, layer: int) -> Tensor:
-    def found() -> Tensor:
+    def compute() -> Tensor:
         given = sinogram.detach().requires_grad_()
         return torch.autograd.grad(_LAYERS[layer]._computed(given), given, gradient)[0]
 
     # Inside of an operation torch records no graph; another thread knows nothing of it.
     with ThreadPoolExecutor(1) as other:
-        return other.submit(found).result()
+        return other.submit(compute).result()
 
 
 @_traced_gradient.register_fake

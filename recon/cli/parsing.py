@@ -467,14 +467,14 @@ def ending_by_signals() -> Iterator[None]:
     main = threading.current_thread() is threading.main_thread()
     mine = [n for n in numbers if main and signal.getsignal(n) is signal.SIG_DFL]
 
-    def told(number: int, frame: Any) -> None:
+    def on_signal(number: int, frame: Any) -> None:
         for n in mine:
             signal.signal(n, signal.SIG_IGN)
         raise Ended(number)
 
     try:
         for n in mine:
-            signal.signal(n, told)
+            signal.signal(n, on_signal)
         yield
     finally:
         for n in mine:

@@ -526,7 +526,7 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     jobs = [_job(arguments, scan, out) for scan, out in zip(arguments.scan, outs, strict=True)]
     refused = []
 
-    def tell_of(name: str, messages: list[str], text: str, error: str) -> None:
+    def print_outcome(name: str, messages: list[str], text: str, error: str) -> None:
         for warning in messages:
             arguments.warn(f"{name}: {warning}")
         refused.extend([f"{name}: {error}"] if error else [])
@@ -536,7 +536,9 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         found = execute.run(jobs, folder, executor, progress) if executor is not None else {}
         for k, job in enumerate(jobs):
             progress("scans", k / len(jobs))
-            tell_of(job.name, *(found[job.name] if found else job.function(folder, *job.args)))
+            print_outcome(
+                job.name, *(found[job.name] if found else job.function(folder, *job.args))
+            )
     for out in outs:
         if _note(folder / f"{out}{_DONE}"):
             (folder / f"{out}{_DONE}").unlink(missing_ok=True)
@@ -570,11 +572,15 @@ def _job(arguments: argparse.Namespace, scan: Path, out: str) -> Any:
     common = {k: v for k, v in vars(arguments).items() if k not in ("run", "warn", "scan", "out")}
     mib = 4 * scan.stat().st_size / 2**20 if scan.is_file() else 0.0
     return execute.Job(
-        str(scan), reconstruct_one, ({**common, "scan": scan.resolve()}, out), (f"{out}*",), mib=mib
+        str(scan),
+        reconstruct_scan,
+        ({**common, "scan": scan.resolve()}, out),
+        (f"{out}*",),
+        mib=mib,
     )
 
 
-def reconstruct_one(folder: Path, options: dict[str, Any], out: str) -> tuple[list[str], str, str]:
+def reconstruct_scan(folder: Path, options: dict[str, Any], out: str) -> tuple[list[str], str, str]:
     """A scan of many, anywhere: warnings, what is printed, and why it is refused.
 
     A note lies beside a finished volume until all are: an interrupted command that is given again
@@ -620,7 +626,7 @@ def reconstruct_one(folder: Path, options: dict[str, Any], out: str) -> tuple[li
 
 
 def _note(path: Path) -> dict[str, Any]:
-    """What :func:`reconstruct_one` noted beside a volume; empty: nothing, or the file is
+    """What :func:`reconstruct_scan` noted beside a volume; empty: nothing, or the file is
     somebody else's."""
     try:
         note = json.loads(path.read_text(encoding="utf-8"))
@@ -696,7 +702,7 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
     )
     progress.close()
     placed = {"axis": scan.info["axis"]} if arguments.find_axis else {}
-    volume = replace(volume, report={**volume.report, **placed, **_made(arguments)}).slices()
+    volume = replace(volume, report={**volume.report, **placed, **_provenance(arguments)}).slices()
     changed = volume.report.get(_MAP)
     if changed is not None:
         beside = map_beside(arguments.out)
@@ -727,7 +733,7 @@ def _config(
     }
 
 
-def _made(arguments: argparse.Namespace) -> dict[str, Any]:
+def _provenance(arguments: argparse.Namespace) -> dict[str, Any]:
     return {
         "torchpcct": VERSION,
         "command": shlex.join(["torchpcct", *arguments.command_line]),
@@ -786,7 +792,7 @@ def _reconstruct_slabs(
         **options,
     )
     progress.close()
-    _tell_volume(arguments, config, grid, source.unit, {**report, **_made(arguments)})
+    _tell_volume(arguments, config, grid, source.unit, {**report, **_provenance(arguments)})
 
 
 def _tell_volume(

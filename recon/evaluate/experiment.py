@@ -256,8 +256,10 @@ def _jobs(
     in_bins = {f"{task.name}: scan in energy bins, signal {s}": s for s in ("present", "absent")}
     weighted = False
     if not store.has("facts", f"2 {task.fingerprint}"):
-        jobs += [Job(name, _do, (given, "scan", signal)) for name, signal in scans.items()]
-        jobs.append(Job(first, _do, (given, "ground_truth"), (f"{place}facts.npz",), tuple(scans)))
+        jobs += [Job(name, _run_job, (given, "scan", signal)) for name, signal in scans.items()]
+        jobs.append(
+            Job(first, _run_job, (given, "ground_truth"), (f"{place}facts.npz",), tuple(scans))
+        )
     wanted = _kernels(methods, None)
     exact = [
         kernel for kernel in wanted if not store.has(f"exact_{kernel}", f"2 {task.fingerprint}")
@@ -267,7 +269,7 @@ def _jobs(
             f"{task.name}: exact noise, {', '.join(exact)}",
             tuple(f"{place}exact_{k}.npz" for k in exact),
         )
-        jobs.append(Job(name, _do, (given, "exact", exact), made, tuple(scans)))
+        jobs.append(Job(name, _run_job, (given, "exact", exact), made, tuple(scans)))
     blocks = _blocks(n)
     groups = min(len(methods), -(-2 * workers // (len(blocks) * len(exposures)))) or 1
     for exposure in exposures:
@@ -298,7 +300,7 @@ def _jobs(
                 jobs.append(
                     Job(
                         name,
-                        _do,
+                        _run_job,
                         (given, "block", exposure, asked, k),
                         (*pieces, f"{place}*sigma_*.npz", f"{place}energies_*.npz"),
                         (first, *in_bins, known) if k else (first, *in_bins),
@@ -309,7 +311,9 @@ def _jobs(
                 )
     if not weighted:
         return jobs
-    first_of_all = [Job(name, _do, (given, "bins", signal)) for name, signal in in_bins.items()]
+    first_of_all = [
+        Job(name, _run_job, (given, "bins", signal)) for name, signal in in_bins.items()
+    ]
     return [*first_of_all, *jobs]
 
 
@@ -442,7 +446,7 @@ def _bench(folder: Path, packed: bytes) -> _Bench:
     return _Bench(folder, *pickle.loads(zlib.decompress(packed)))
 
 
-def _do(folder: Path, given: _Bench | bytes, job: str, *args: Any) -> None:
+def _run_job(folder: Path, given: _Bench | bytes, job: str, *args: Any) -> None:
     bench = given if isinstance(given, _Bench) else _bench(folder, given)
     getattr(bench, job)(*args)
 

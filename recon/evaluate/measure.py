@@ -287,7 +287,9 @@ class Measurement:
 
         def clean() -> dict[str, Any]:
             pair = [draws.noise_free(p, exposure_s) for p in (True, False)]
-            return _of([pair], method, reader, keep=True, fbp=pair[0].fbp(draws.kernels[0]))
+            return _measure_pairs(
+                [pair], method, reader, keep=True, fbp=pair[0].fbp(draws.kernels[0])
+            )
 
         self._clean = self.store.piece(f"{self._place}/clean", self._key, clean)
         self._known: dict[str, Any] | None = None
@@ -301,7 +303,7 @@ class Measurement:
         """Realisations ``k``; ``pairs`` gives them, if they have not been measured before."""
 
         def compute() -> dict[str, Any]:
-            return _of(
+            return _measure_pairs(
                 pairs(), self.method, self.reader, keep=k.start == 0, adjoints=self._adjoints
             )
 
@@ -340,7 +342,7 @@ class Measurement:
         )
 
 
-def _of(
+def _measure_pairs(
     pairs: Sequence[Sequence[Any]],
     method: Method,
     reader: Reader,

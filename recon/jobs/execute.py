@@ -283,7 +283,7 @@ def _set_safe_path(value: str | None) -> None:
         os.environ[_SAFE_PATH] = value
 
 
-class _Told(BaseException):
+class _EndSignal(BaseException):
     """A signal has told a process to end: what its job is writing is taken back on the way out."""
 
 
@@ -300,14 +300,14 @@ def _begin_process(safe_path: str | None) -> None:
     """
     _set_safe_path(safe_path)
 
-    def told(number: int, frame: Any) -> None:
+    def on_signal(number: int, frame: Any) -> None:
         if not _working:
             os._exit(128 + number)
-        raise _Told(number)
+        raise _EndSignal(number)
 
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         if hasattr(signal, name):
-            signal.signal(getattr(signal, name), told)
+            signal.signal(getattr(signal, name), on_signal)
     # A process whose parent was killed would wait for its next job forever.
     parent: Any = multiprocessing.parent_process()
 
@@ -506,7 +506,7 @@ def _compiling(own: bool) -> Iterator[Callable[[], float]]:
 
 
 @contextlib.contextmanager
-def heard(*loggers: str, alone: bool = False) -> Iterator[list[str]]:
+def captured_warnings(*loggers: str, alone: bool = False) -> Iterator[list[str]]:
     """The warnings that loggers are given meanwhile; ``""`` is the root. ``alone``: nobody else
     hears them."""
     said: list[str] = []
@@ -528,14 +528,14 @@ def heard(*loggers: str, alone: bool = False) -> Iterator[list[str]]:
             logger.propagate = propagate
 
 
-def _work(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _Run) -> _Done:
+def _run_packed(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _Run) -> _Done:
     """Run a job where this is called."""
     global _working
     try:
         _working = True
         return _do_job(call, module, digest, makes, of)
-    except _Told as told:
-        os._exit(128 + told.args[0])
+    except _EndSignal as ended:
+        os._exit(128 + ended.args[0])
     finally:
         _working = False
 
@@ -568,7 +568,7 @@ def _do_job(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # What a worker logs the client says instead; of its own process it has heard it.
-        with _compiling(own) as compiled, heard(*([] if own else [""])) as said:
+        with _compiling(own) as compiled, captured_warnings(*([] if own else [""])) as said:
             value = function(folder, *args)
     except OSError as error:
         if scratch is None or (error.errno not in _DISK and not isinstance(error, WriteError)):
@@ -713,7 +713,7 @@ def _run(
                 module = job.module or job.function.__module__
                 call = packed_call(executor, (job.function, job.args))
                 running[
-                    executor.submit(_work, call, module, source_digest(module), job.makes, of)
+                    executor.submit(_run_packed, call, module, source_digest(module), job.makes, of)
                 ] = job
             for future in wait_for(running, 1.0, FIRST_COMPLETED)[0] if running else ():
                 job = running.pop(future)

@@ -199,13 +199,15 @@ def blockwise(
     """
     shape = estimate.shape[-3:]
 
-    def told(part: tuple[slice, ...]) -> Tensor:
+    def condition_of(part: tuple[slice, ...]) -> Tensor:
         level = torch.log(scales[part] / REFERENCE_SCALE_HU).mean().clamp(-3.0, 3.0)
         return torch.cat([level.reshape(1, 1).to(condition), condition[:, 1:]], 1)
 
     if max(shape) <= block + 2 * halo:
         return same_kind(
-            network(estimate, towards, told((slice(None),) * 3), smoothed), estimate, network
+            network(estimate, towards, condition_of((slice(None),) * 3), smoothed),
+            estimate,
+            network,
         )
     total, weight = (
         torch.zeros_like(estimate),
@@ -215,7 +217,12 @@ def blockwise(
         here: Any = (..., *part)
         seen = estimate[here]
         out = same_kind(
-            network(seen, towards[here], told(part), None if smoothed is None else smoothed[here]),
+            network(
+                seen,
+                towards[here],
+                condition_of(part),
+                None if smoothed is None else smoothed[here],
+            ),
             seen,
             network,
         )

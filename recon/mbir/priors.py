@@ -69,7 +69,7 @@ class PlugAndPlay(nn.Module):
         )
         self._denoised = denoiser_of(denoiser)
 
-    def told(self, noise: Tensor, zero_hu: float) -> Prior:
+    def with_noise(self, noise: Tensor, zero_hu: float) -> Prior:
         """The prior of scans whose noise is known.
 
         Args:
@@ -89,7 +89,7 @@ class PlugAndPlay(nn.Module):
         noise: Tensor,
         zero_hu: float = 0.0,
     ) -> Tensor:
-        """See :meth:`told` and :meth:`recon.mbir.network.Network.forward`; of the four only
+        """See :meth:`with_noise` and :meth:`recon.mbir.network.Network.forward`; of the four only
         ``towards`` counts, and of ``condition`` the noise scale."""
         found = []
         for volume, level, sigma in zip(towards, condition[:, 0], noise, strict=True):

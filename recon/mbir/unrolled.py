@@ -205,7 +205,7 @@ def bound(prior: Prior, problem: Quadratic, spectrum: Tensor) -> Prior:
     if not isinstance(prior, PlugAndPlay):
         return prior
     noise = guide_noise(spectrum, problem.b.shape[-3:], problem.voxel_mm, prior.smoothed_by)
-    return prior.told(noise, problem.zero_hu)
+    return prior.with_noise(noise, problem.zero_hu)
 
 
 def first_views(problem: Quadratic, bilateral: bool) -> Views:

@@ -96,7 +96,7 @@ class LocalGram:
         """G x of columns ``(n, k)`` float32."""
         out = np.zeros_like(x)
         if x.shape[1] == 1:
-            self._apply_one(x[:, 0], out[:, 0])
+            self._apply_single(x[:, 0], out[:, 0])
             return out
         at, parts = self.slices, self._used(x)
         for (z, b), block in self.blocks.items():
@@ -106,7 +106,7 @@ class LocalGram:
                     out[at[to] : at[to + 1], columns] += (block.T if turned else block) @ part
         return out
 
-    def _apply_one(self, x: Floats, out: Floats) -> None:
+    def _apply_single(self, x: Floats, out: Floats) -> None:
         at = self.slices
         for (z, b), block in self.blocks.items():
             here, there = slice(at[z], at[z + 1]), slice(at[z + b], at[z + b + 1])

@@ -130,7 +130,7 @@ def configured(values: Mapping[str, Any], folder: Path) -> SimulationConfig:
 
 def grid_of(name: str, value: Any) -> VolumeGrid:
     """A grid of ``shape``, ``spacing`` and ``center``, numbers by axis or ``[z, y, x]``."""
-    made: VolumeGrid = _made(name, VolumeGrid, _mapping(name, value, _GRID), order="zyx")
+    made: VolumeGrid = _build(name, VolumeGrid, _mapping(name, value, _GRID), order="zyx")
     return made
 
 
@@ -172,7 +172,7 @@ def _in_order(name: str, value: Any, order: str) -> Any:
     return [value[a] for a in order if a in value]
 
 
-def _made(name: str, function: Any, given: Mapping[str, Any], order: str = "xyz") -> Any:
+def _build(name: str, function: Any, given: Mapping[str, Any], order: str = "xyz") -> Any:
     """What a function or class makes of the ``given`` parameters; those given by axis come in
     ``order``.
 
@@ -232,7 +232,7 @@ def _scene(value: Any, folder: Path) -> tuple[Scene | VoxelScene, dict[str, Any]
         made = plaque_variant(variant, **_mapping("scene", own, known))[0]
     else:
         make: Any = {"thorax": thorax, "water": water_cylinder}[kind]
-        made = _made("scene", make, _mapping("scene", own, (*_parameters(make), "bodies")))
+        made = _build("scene", make, _mapping("scene", own, (*_parameters(make), "bodies")))
     return (made.add(*more) if more else made), {"kind": kind, **given}
 
 
@@ -244,7 +244,7 @@ def _body(k: int, value: Any) -> Body:
     missing = [n for n in ("name", "material") if n not in common]
     if missing:
         raise ValueError(f"{name} needs {', '.join(missing)}")
-    solid = _made(name, shape, _mapping(name, given, tuple(_parameters(shape))))
+    solid = _build(name, shape, _mapping(name, given, tuple(_parameters(shape))))
     return Body(common["name"], solid, common["material"], common.get("parent"))
 
 

@@ -168,9 +168,9 @@ def geometry_test(
             continue
         # The wider slopes reach farther, the narrower ones see smaller errors.
         level = FALSE_ALARMS / (3.0 * len(causes) * len(_COLUMNS))
-        best = next((f for f in reversed(fits) if f.found(level, _LARGEST)), fits[0])
+        best = next((f for f in reversed(fits) if f.exceeds(level, _LARGEST)), fits[0])
         sizes[name], errors[name] = best.size, best.error
-        if best.found(level, _LARGEST):
+        if best.exceeds(level, _LARGEST):
             ranked.append((best.explained / of.here.numel(), name, ""))
     mismatch, differ = _mismatch(pairs, FALSE_ALARMS / 3.0)
     mirrored = differ > 0 and pairs.agrees_mirrored(min(_DIFFER, mismatch / 4.0))
@@ -346,7 +346,7 @@ class _Fit:
     p_value: float
     explained: float
 
-    def found(self, level: float, most: float = math.inf) -> bool:
+    def exceeds(self, level: float, most: float = math.inf) -> bool:
         return self.p_value < level and abs(self.size) < most
 
 
@@ -460,7 +460,7 @@ def _tested(
     # A wave has half the square of its amplitude.
     swing, swinging = _swing(score, bent, design, math.sqrt(2.0 * parted / float(power.sum())))
     findings = []
-    if fit.found(false_alarms / 2):
+    if fit.exceeds(false_alarms / 2):
         findings.append(_centre_text(fit.size, 2.0 * fit.error))
     if swinging < false_alarms / 2:
         findings.append(

@@ -53,7 +53,7 @@ class RayPairs:
         self._at = np.arange(0, angles.size, max(1, math.ceil(values.numel() / _MOST)))
         self.base = self._order[self._at]
         self.angles = angles[self.base]
-        self.here, self.conjugate, self.known = self._look(self.base)
+        self.here, self.conjugate, self.known = self._with_conjugates(self.base)
         self.difference = self.here - self.conjugate
         self.parted = parted * float(self.known.sum())
         self._slopes: dict[tuple[str, int], tuple[Any, ...]] = {}
@@ -100,7 +100,7 @@ class RayPairs:
             geometry, window, values = _joined_rows(geometry, window, values)
         return cls(ConjugateRays(geometry, window, about), values, parted)
 
-    def _look(self, views: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor]:
+    def _with_conjugates(self, views: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor]:
         return self._values[torch.from_numpy(views)], *self.rays.conjugate(self._values, views)
 
     def shifted(self) -> Pattern:
@@ -176,7 +176,7 @@ class RayPairs:
             step = np.where(good, step, 1.0)
             first = self.rays.window.first_column
             rate = (first[ends[1]] - first[ends[0]]) / step
-            looked = [self._look(e) for e in ends]
+            looked = [self._with_conjugates(e) for e in ends]
             mask = torch.from_numpy(good)[:, None, None]
             sides = [(*part[:2], part[2] & mask) for part in looked]
             self._beside = (

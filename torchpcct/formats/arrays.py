@@ -46,10 +46,11 @@ def read_array(name: str | Sequence[str], folder: Path = Path(), pick: Any = Non
     """
     paths = matching(name, folder) if isinstance(name, str) else [folder / each for each in name]
     if len(paths) == 1:
-        return _one(paths[0], pick)
-    at = (slice(None),) if pick is None else pick((len(paths), *_one(paths[0]).shape))
+        return _read_file(paths[0], pick)
+    at = (slice(None),) if pick is None else pick((len(paths), *_read_file(paths[0]).shape))
     arrays = [
-        _one(path) if pick is None else _one(path, lambda shape: at[1:]) for path in paths[at[0]]
+        _read_file(path) if pick is None else _read_file(path, lambda shape: at[1:])
+        for path in paths[at[0]]
     ]
     shapes = {a.shape for a in arrays}
     if len(shapes) > 1:
@@ -57,7 +58,7 @@ def read_array(name: str | Sequence[str], folder: Path = Path(), pick: Any = Non
     return np.stack(arrays)
 
 
-def _one(path: Path, pick: Any = None) -> Any:
+def _read_file(path: Path, pick: Any = None) -> Any:
     """The numbers of a file; with ``pick``, a function of the number of axes and the first length,
     no more of them than the index that it returns."""
     ending = path.suffix.lower()

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from recon.evaluate.anatomies import TISSUES_HU, Anatomy, anatomy
 from recon.evaluate.tasks import with_painted, without_inset
-from recon.jobs.execute import heard
+from recon.jobs.execute import captured_warnings
 from recon.jobs.store import Pieces
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.recovery import recovered_contrast
@@ -130,7 +130,7 @@ def _recovered(
     for pair in pairs:
         volumes, texts = [], []
         for scan in pair:
-            with heard("recon", "torchpcct", alone=True) as messages:
+            with captured_warnings("recon", "torchpcct", alone=True) as messages:
                 try:
                     volume = reconstruct(scan, grid, method)
                 except (ValueError, TypeError) as error:

@@ -21,7 +21,7 @@ import torch
 
 from recon import reconstruct
 from recon.evaluate.anatomies import ANATOMIES
-from recon.jobs.execute import heard
+from recon.jobs.execute import captured_warnings
 from recon.jobs.store import Pieces
 from recon.study.hardcases.anatomies import METHODS as ANATOMY_METHODS
 from recon.study.hardcases.anatomies import anatomy_rows
@@ -232,7 +232,7 @@ class _Base:
         """What a method makes of it: volume, warnings, rms noise."""
 
         def compute() -> tuple[torch.Tensor, list[str], float]:
-            with heard("recon", "torchpcct", alone=True) as messages:
+            with captured_warnings("recon", "torchpcct", alone=True) as messages:
                 volume = _reconstruct(self.noisy, self.grid, method)
                 noise = _rms(volume.data - _reconstruct(self.clean, self.grid, method).data)
             return volume.data, [*volume.report.get("warnings", ()), *messages], noise
@@ -381,7 +381,7 @@ def _tried(
     """A volume, the warnings, and seconds; no volume but its message where the scan or method is
     refused."""
     start = time.perf_counter()
-    with heard("recon", "torchpcct", alone=True) as messages:
+    with captured_warnings("recon", "torchpcct", alone=True) as messages:
         try:
             if isinstance(scan, Exception):
                 raise scan
