@@ -37,7 +37,7 @@ from recon.cli import main
 from recon.study import registry
 from recon.jobs.store import Store
 out, name = sys.argv[1:]
-kind = registry.part(name).Settings if name != "evaluate" else type("", (), {})
+kind = registry.settings_class(name) if name != "evaluate" else type("", (), {})
 kind.QUICK = TINY.get(name)
 piece = Store.piece
 def noted(self, at, key, compute):

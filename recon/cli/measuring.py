@@ -395,7 +395,7 @@ def _own_study(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     for name in getattr(arguments, "cases", None) or []:
         check_case(name)
     given = {name: value for name, value in vars(arguments).items() if value is not None}
-    settings = registry.part(arguments.command).Settings.of(given, arguments.quick)
+    settings = registry.settings_class(arguments.command).of(given, arguments.quick)
     _run_study(arguments.command, settings, arguments, progress)
 
 
@@ -423,7 +423,7 @@ def _verify(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         committed = json.loads(
             (root / "notebooks" / registry.folder(name) / "report.json").read_text(encoding="utf-8")
         )
-        settings = registry.part(name).Settings.of(committed["settings"])
+        settings = registry.settings_class(name).of(committed["settings"])
         again = json.loads(registry.run(name, settings, progress).json)
         found = list(results.differences(committed, again))
         progress.close()

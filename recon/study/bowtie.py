@@ -98,7 +98,7 @@ _COLOURS = dict(zip(BOWTIES, ("tab:blue", "tab:orange"), strict=True))
 
 
 @dataclass(frozen=True)
-class Settings(StudySettings):
+class BowtieSettings(StudySettings):
     """Settings of the study; the quick ones: a quarter of the views, coarse maps, few photons.
 
     Args:
@@ -155,7 +155,7 @@ class Settings(StudySettings):
 
 
 def measure(
-    settings: Settings, progress: Progress = silent, folder: str | Path | None = None
+    settings: BowtieSettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
     """Dose, noise, and the plaque by FBP and MBIR, in resumable pieces."""
     s, pieces = settings, Pieces(folder, settings)
@@ -206,7 +206,7 @@ def measure(
     return Measured(s, data, (maps, images))
 
 
-def _kept(settings: Settings, pieces: Pieces, name: str) -> Any:
+def _kept(settings: BowtieSettings, pieces: Pieces, name: str) -> Any:
     """A piece of the study by its name; of the CTDI phantom the doses in its bores, by four
     readings of "dose"."""
     s, (kind, _, scene) = settings, name.partition("_")
@@ -493,7 +493,7 @@ def transmission(scanners: dict[str, Scanner]) -> dict[str, Any]:
 
 
 def _combined(
-    s: Settings, saved: dict[str, float], folder: Path | None, progress: Progress
+    s: BowtieSettings, saved: dict[str, float], folder: Path | None, progress: Progress
 ) -> list[dict[str, Any]]:
     """Scan, reconstruct, measure; ``saved``: kind of dose → factor that the ROI bowtie saves at
     equal exposure.

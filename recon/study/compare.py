@@ -39,7 +39,7 @@ _HIGH_S = paper.DOSES["5.7x"]
 
 
 @dataclass(frozen=True)
-class Settings(StudySettings):
+class CompareSettings(StudySettings):
     """Settings of the comparison.
 
     Args:
@@ -83,7 +83,7 @@ class Settings(StudySettings):
 
 
 def measure(
-    settings: Settings, progress: Progress = silent, folder: str | Path | None = None
+    settings: CompareSettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
     """Simulate, reconstruct, measure; see :mod:`recon.study.study`."""
     s = settings
@@ -185,7 +185,7 @@ _BEYOND = 1000.0
 """Intervals are drawn to this factor, and its inverse."""
 
 
-def dose_chart(records: list[dict[str, Any]], settings: Settings) -> Any:
+def dose_chart(records: list[dict[str, Any]], settings: CompareSettings) -> Any:
     """Dose factors with their intervals by question, a colour for each exposure; 1 and what the
     paper assumes marked.
 

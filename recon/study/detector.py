@@ -50,7 +50,7 @@ INSET_MM = 3.36
 
 
 @dataclass(frozen=True)
-class Settings(StudySettings):
+class DetectorSettings(StudySettings):
     """Settings of the detector study; the quick ones follow a fifth of the photons.
 
     Args:
@@ -74,7 +74,7 @@ class Settings(StudySettings):
 
 
 def measure(
-    settings: Settings, progress: Progress = silent, folder: str | Path | None = None
+    settings: DetectorSettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
     """Follow photons and compute rates, in resumable pieces."""
     s, rng = settings, np.random.default_rng(settings.seed)
@@ -111,7 +111,7 @@ def measure(
     return Measured(s, data)
 
 
-def _pile_up(settings: Settings, pieces: Pieces, dead_time_ns: float) -> Any:
+def _pile_up(settings: DetectorSettings, pieces: Pieces, dead_time_ns: float) -> Any:
     return pieces(f"pile_up_{dead_time_ns:g}", partial(pile_up, dead_time_ns))
 
 

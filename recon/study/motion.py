@@ -71,7 +71,7 @@ is noise."""
 
 
 @dataclass(frozen=True)
-class Settings(StudySettings):
+class MotionSettings(StudySettings):
     """Settings of the motion study.
 
     Args:
@@ -163,7 +163,7 @@ class Found:
 
 
 def measure(
-    settings: Settings, progress: Progress = silent, folder: str | Path | None = None
+    settings: MotionSettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
     """Simulate and reconstruct residual motion in both scanners, and compensate the PCCT's, in
     resumable pieces."""
@@ -208,7 +208,7 @@ def measure(
 
 
 def _residual(
-    s: Settings, m: Found, name: str, reference: Reference, pieces: Pieces, progress: Progress
+    s: MotionSettings, m: Found, name: str, reference: Reference, pieces: Pieces, progress: Progress
 ) -> tuple[Scan, Scan]:
     """Images with residual motion; returns the scans at rest and of the largest motion."""
     grid = reference.grid
@@ -229,7 +229,7 @@ def _residual(
     return still, moving
 
 
-def _scan(s: Settings, pieces: Pieces, name: str, fraction: float) -> Scan:
+def _scan(s: MotionSettings, pieces: Pieces, name: str, fraction: float) -> Scan:
     scanner = SCANNERS[name](paper.FULL_VIEWS[name] // s.thinning)
     scene, plaque = plaque_scene(motion=s.motion.scaled(fraction))
     run = partial(
@@ -283,7 +283,7 @@ def observe(volume: Tensor, reference: Reference, rest: Tensor) -> PlaqueImage:
 
 
 def compensate(
-    s: Settings,
+    s: MotionSettings,
     still: Scan,
     moving: Scan,
     reference: Reference,
@@ -513,7 +513,7 @@ def _images(m: Found) -> Any:
     return figure
 
 
-def _curves(s: Settings, m: Found) -> Any:
+def _curves(s: MotionSettings, m: Found) -> Any:
     """NRMSE, lumen area and depth of the core's basin against residual motion, uncompensated and
     compensated."""
     figure, axes = curve_axes(

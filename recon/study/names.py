@@ -18,6 +18,11 @@ _TABLES = {"_PLAQUE": "", "_BODY": "body-", "_CONE": "cone-"}
 """Of ``hardcases/cases.py``, in their order, and what stands before their names."""
 
 
+def settings_name(folder: str) -> str:
+    """Name of the class of a study's settings, ``SomeNameSettings`` of the module ``some_name``."""
+    return "".join(word.capitalize() for word in folder.split("_")) + "Settings"
+
+
 @cache
 def setting_names(folder: str) -> tuple[str, ...]:
     """Fields of a study's settings.
@@ -28,7 +33,7 @@ def setting_names(folder: str) -> tuple[str, ...]:
     files = [_HERE / f"{folder}.py", *sorted((_HERE / folder).glob("*.py"))]
     for tree in (ast.parse(path.read_bytes()) for path in files if path.is_file()):
         for node in tree.body:
-            if isinstance(node, ast.ClassDef) and node.name == "Settings":
+            if isinstance(node, ast.ClassDef) and node.name == settings_name(folder):
                 lines = [
                     n
                     for n in node.body
@@ -39,7 +44,7 @@ def setting_names(folder: str) -> tuple[str, ...]:
                     for n in lines
                     if "ClassVar" not in ast.unparse(n.annotation)
                 )
-    raise LookupError(f"no Settings in {files}")
+    raise LookupError(f"no {settings_name(folder)} in {files}")
 
 
 @cache

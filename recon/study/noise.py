@@ -62,7 +62,7 @@ _IMAGES_SCALE = 0.62  # noise does not compress: twenty panels stay below 400 kB
 
 
 @dataclass(frozen=True)
-class Settings(StudySettings):
+class NoiseSettings(StudySettings):
     """Settings of the noise study.
 
     Args:
@@ -118,7 +118,7 @@ class Settings(StudySettings):
 
 @dataclass
 class Moments:
-    """What the study computes and draws. ``S`` settings: :attr:`Settings.axes`.
+    """What the study computes and draws. ``S`` settings: :attr:`NoiseSettings.axes`.
 
     Attributes:
         scanned: noise-free scan, grids and ROIs.
@@ -146,7 +146,7 @@ class Moments:
 
 
 def measure(
-    settings: Settings, progress: Progress = silent, folder: str | Path | None = None
+    settings: NoiseSettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
     """Simulate, take exact moments, draw realisations, reconstruct a few in full, in resumable
     pieces."""
@@ -199,7 +199,7 @@ def measure(
 
 
 def _realisations(
-    settings: Settings,
+    settings: NoiseSettings,
     near: Scan,
     matrix: Tensor,
     expected: Any,
@@ -242,7 +242,7 @@ def _realisations(
 
 
 def _reconstructions(
-    settings: Settings, scanned: PlaqueScan, means: Any, sd: Any, progress: Progress
+    settings: NoiseSettings, scanned: PlaqueScan, means: Any, sd: Any, progress: Progress
 ) -> tuple[dict[tuple[str, float], Any], dict[str, Any]]:
     """The first realisation's images at the tables' dose, and how far FBP in full is from
     ``means`` ``(n, S, 2)``."""
@@ -263,7 +263,7 @@ def _reconstructions(
     }
 
 
-def _dose_table(s: Settings, m: Moments, exposure: float) -> list[dict[str, Any]]:
+def _dose_table(s: NoiseSettings, m: Moments, exposure: float) -> list[dict[str, Any]]:
     """One row per setting: exact, by all realisations, by the first ten, and the paper's
     entries."""
     exact, values = m.exact(exposure), m.means[exposure]
@@ -305,7 +305,7 @@ def _dose_table(s: Settings, m: Moments, exposure: float) -> list[dict[str, Any]
     return rows
 
 
-def _against_dose(s: Settings, m: Moments) -> dict[str, Any]:
+def _against_dose(s: NoiseSettings, m: Moments) -> dict[str, Any]:
     """Slope of log σ of the ROI means against log exposure, −½ for counting noise, and how exact
     the noise is.
 
@@ -326,7 +326,7 @@ def _against_dose(s: Settings, m: Moments) -> dict[str, Any]:
     }
 
 
-def _ten_run_experiments(s: Settings, m: Moments, exposure: float) -> dict[str, Any]:
+def _ten_run_experiments(s: NoiseSettings, m: Moments, exposure: float) -> dict[str, Any]:
     """How often each setting has the highest CNR in experiments of ten realisations."""
     shared = few_run_tables(m.expected, m.covariance / exposure, s.experiments, s.seed)
     winners = np.bincount(shared.cnr.argmax(-1), minlength=len(s.axes)) / s.experiments
@@ -336,7 +336,7 @@ def _ten_run_experiments(s: Settings, m: Moments, exposure: float) -> dict[str, 
     }
 
 
-def _pairs(s: Settings, m: Moments, exposure: float) -> dict[str, Any]:
+def _pairs(s: NoiseSettings, m: Moments, exposure: float) -> dict[str, Any]:
     """CNR differences: the paper's best against all others, and how many of all pairs are
     established."""
     axes, exact = s.axes, m.exact(exposure)
@@ -577,7 +577,7 @@ def figures(measured: Measured) -> dict[str, Any]:
     }
 
 
-def _images(s: Settings, m: Moments) -> Any:
+def _images(s: NoiseSettings, m: Moments) -> Any:
     """One realisation at the tables' dose: kernels down, voxel sizes across."""
     rois = m.scanned.rois
     rows = []
@@ -599,7 +599,7 @@ def _images(s: Settings, m: Moments) -> Any:
     return figure
 
 
-def _cnrs(s: Settings, rows: list[dict[str, Any]]) -> Any:
+def _cnrs(s: NoiseSettings, rows: list[dict[str, Any]]) -> Any:
     """CNR of every setting: exact, n realisations with interval, range of 10-run experiments,
     the paper's."""
     from matplotlib.figure import Figure

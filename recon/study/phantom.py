@@ -49,7 +49,7 @@ _MARGIN_MM = 0.1
 
 
 @dataclass(frozen=True)
-class Settings(StudySettings):
+class PhantomSettings(StudySettings):
     """Settings of the study; the quick ones take a raster four times as coarse.
 
     Args:
@@ -72,7 +72,7 @@ class Settings(StudySettings):
 
 
 def measure(
-    settings: Settings, progress: Progress = silent, folder: str | Path | None = None
+    settings: PhantomSettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
     """Materials and lengths; nothing is kept in ``folder``."""
     scene, plaque = plaque_scene()

@@ -34,7 +34,7 @@ _EDGE_MM = 9.2
 
 
 @dataclass(frozen=True)
-class Settings(StudySettings):
+class RecoverySettings(StudySettings):
     """Settings of the study.
 
     Args:
@@ -92,7 +92,7 @@ class Settings(StudySettings):
 
 
 def measure(
-    settings: Settings, progress: Progress = silent, folder: str | Path | None = None
+    settings: RecoverySettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
     """Insert, reconstruct, compare; see :mod:`recon.study.study`.
 
@@ -146,7 +146,7 @@ def shown_by_mbir(report: Mapping[str, Any]) -> str:
     return json.dumps({"weights_sha256": report["weights_sha256"], "rows": rows}, indent=1) + "\n"
 
 
-def _grid(settings: Settings) -> VolumeGrid:
+def _grid(settings: RecoverySettings) -> VolumeGrid:
     n = round(_EDGE_MM / settings.voxel_mm)
     return VolumeGrid((n, n, n), settings.voxel_mm, plaque_scene()[1].position[::-1])
 
@@ -158,7 +158,7 @@ def _noise_scales(clean: Scan, grid: VolumeGrid, exposures_s: Sequence[float]) -
     return [float(problem.term_of(nothing, e).in_noise_units().unit_hu) for e in exposures_s]
 
 
-def _clean(settings: Settings, pieces: Pieces) -> Scan:
+def _clean(settings: RecoverySettings, pieces: Pieces) -> Scan:
     """The noise-free scan."""
     scene, _ = plaque_scene()
     scanner = presets.pcct(views=settings.views)
@@ -168,7 +168,11 @@ def _clean(settings: Settings, pieces: Pieces) -> Scan:
 
 
 def _realisation(
-    settings: Settings, pieces: Pieces, exposure_s: float, seed: int, clean: Scan | None = None
+    settings: RecoverySettings,
+    pieces: Pieces,
+    exposure_s: float,
+    seed: int,
+    clean: Scan | None = None,
 ) -> list[dict[str, Any]]:
     """All balls and methods in one noise realisation."""
     rows: list[dict[str, Any]] = pieces(
@@ -178,7 +182,7 @@ def _realisation(
 
 
 def _rows(
-    s: Settings, pieces: Pieces, exposure_s: float, seed: int, clean: Scan | None
+    s: RecoverySettings, pieces: Pieces, exposure_s: float, seed: int, clean: Scan | None
 ) -> list[dict[str, Any]]:
     scan = clean or _clean(s, pieces)
     balls = [InsertedBall(*ball) for ball in s.balls]
@@ -216,7 +220,7 @@ def figures(measured: Measured) -> dict[str, Any]:
     """Contrast recovery by ball, a colour for each method, an exposure in each panel."""
     from matplotlib.figure import Figure
 
-    s: Settings = measured.settings
+    s: RecoverySettings = measured.settings
     rows = measured.data["rows"]
     figure = Figure((5.4 * len(s.exposures_s), 4.2), dpi=110, layout="constrained")
     panels: Any = figure.subplots(1, len(s.exposures_s), sharey=True, squeeze=False)[0]

@@ -12,12 +12,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from recon.study.names import check_setting, setting_names
+from recon.study.names import check_setting, setting_names, settings_name
 from torchpcct.validate import choice
 
 if TYPE_CHECKING:
     from recon.study.report import Report
-    from recon.study.study import Measured, Progress
+    from recon.study.study import Measured, Progress, StudySettings
 
 STUDIES: dict[str, str] = {
     "compare": (
@@ -78,6 +78,16 @@ def part(name: str) -> Any:
     return importlib.import_module(f"recon.study.{folder(name)}")
 
 
+def settings_class(name: str) -> type[StudySettings]:
+    """What the settings of a study are: the class that is named after its module.
+
+    Raises:
+        ValueError: an unknown study.
+    """
+    kind: type[StudySettings] = getattr(part(name), settings_name(folder(name)))
+    return kind
+
+
 def build_settings(
     name: str, *, quick: bool = False, seed: int | None = None, changes: Sequence[str] = ()
 ) -> Any:
@@ -103,8 +113,7 @@ def build_settings(
             values[key] = ast.literal_eval(text)
         except (SyntaxError, ValueError):
             values[key] = text
-    kind = part(name).Settings
-    return kind.of(values, quick)
+    return settings_class(name).of(values, quick)
 
 
 def run(
@@ -132,11 +141,10 @@ def measured(
     """
     from recon.study.study import Timed, silent  # loads torch
 
-    study = part(name)
-    if not isinstance(settings, study.Settings):
-        kind = study.Settings
+    study, kind = part(name), settings_class(name)
+    if not isinstance(settings, kind):
         raise TypeError(
-            f"settings must be {kind.__module__}.Settings, got {type(settings).__name__}"
+            f"settings must be {kind.__module__}.{kind.__name__}, got {type(settings).__name__}"
         )
     timed = Timed(progress or silent)
     found: Measured = study.measure(settings, timed, pieces)

@@ -74,7 +74,7 @@ _WIRE_ROWS = 4
 
 
 @dataclass(frozen=True)
-class Settings(StudySettings):
+class ResolutionSettings(StudySettings):
     """Settings of the resolution study; it draws no noise.
 
     Args:
@@ -117,7 +117,7 @@ class Imaged:
 
 
 def measure(
-    settings: Settings, progress: Progress = silent, folder: str | Path | None = None
+    settings: ResolutionSettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
     """Simulate, blur, segment, measure, in resumable pieces."""
     pieces = Pieces(folder, settings)
@@ -148,7 +148,7 @@ def measure(
 def _image(
     name: str,
     bodies: tuple[Scene, Plaque],
-    settings: Settings,
+    settings: ResolutionSettings,
     pieces: Pieces,
     progress: Callable[[float], None],
 ) -> tuple[Imaged, dict[str, Any]]:

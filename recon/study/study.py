@@ -3,7 +3,8 @@
 A study is a module (or a package that exports the same names) of :mod:`recon.study`, listed in
 :mod:`recon.study.registry`, which runs it by its name. It has
 
-* ``Settings(StudySettings)``, a frozen dataclass that validates itself;
+* ``SomeNameSettings(StudySettings)`` of the module ``some_name``, a frozen dataclass that validates
+  itself;
 * ``measure(settings, progress=silent, folder=None) -> Measured``, which simulates, reconstructs and
   measures. It prints nothing and writes nothing, but finished pieces into ``folder``
   (:mod:`recon.jobs.store`), so that an interrupted study goes on;

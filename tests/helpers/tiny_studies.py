@@ -119,7 +119,7 @@ class TinyStudy:
 def run_tiny(name: str, folder: Path) -> TinyStudy:
     """Measure a study at its smallest scale."""
     steps: list[tuple[str, float]] = []
-    settings = registry.part(name).Settings(**TINY[name])
+    settings = registry.settings_class(name)(**TINY[name])
     measured = registry.measured(
         name, settings, lambda step, fraction: steps.append((step, fraction)), folder
     )

@@ -198,9 +198,9 @@ def test_the_examples_of_studies_are_settings_that_they_take():
                 assert registry.build_settings(given.name, quick=given.quick, changes=given.changes)
             else:
                 values = {key: value for key, value in vars(given).items() if value is not None}
-                assert registry.part(name).Settings.of(values, given.quick)
+                assert registry.settings_class(name).of(values, given.quick)
     assert (
-        f"(default {registry.part('hardcases').Settings().views})"
+        f"(default {registry.settings_class('hardcases')().views})"
         in _parsers()["hardcases"].format_help()
     )
 

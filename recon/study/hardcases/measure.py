@@ -79,7 +79,7 @@ _COLOURS = {"right": "tab:green", "warned": "tab:orange", "unseen": "tab:grey", 
 
 
 @dataclass(frozen=True)
-class Settings(StudySettings):
+class HardcasesSettings(StudySettings):
     """Settings of the hard cases; the quick ones have an eighth of the views, FBP alone, every
     case.
 
@@ -157,7 +157,7 @@ def verdict(
 
 
 def measure(
-    settings: Settings, progress: Progress = silent, folder: str | Path | None = None
+    settings: HardcasesSettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
     """Reconstruct every case by every method; see :mod:`recon.study.study`.
 
@@ -242,7 +242,7 @@ class _Base:
         return self._sound[method]
 
 
-def _plaque_base(settings: Settings, pieces: Pieces, progress: Progress) -> _Base:
+def _plaque_base(settings: HardcasesSettings, pieces: Pieces, progress: Progress) -> _Base:
     scene, plaque = plaque_scene(vessel_length=_GRID_MM[0] - 0.2)
     scanner = presets.pcct(views=settings.views)
     scanner = scanner.replace(geometry=replace(scanner.geometry, rows=_ROWS))
@@ -267,14 +267,14 @@ def _plaque_base(settings: Settings, pieces: Pieces, progress: Progress) -> _Bas
     return _Base(scene, clean, noisy, grid, truth, simulate, truth_of, plaque, pieces)
 
 
-def _body_base(settings: Settings, pieces: Pieces, progress: Progress) -> _Base:
+def _body_base(settings: HardcasesSettings, pieces: Pieces, progress: Progress) -> _Base:
     scene = thorax()
     clean = pieces("scan", partial(body_scan, scene))
     noisy = clean.with_noise(NOISE_FREE_EXPOSURE_S, settings.seed)
     return _Base(scene, clean, noisy, GRID, body_truth(scene), body_scan, body_truth, None, pieces)
 
 
-def _cone_base(settings: Settings, pieces: Pieces, progress: Progress) -> _Base:
+def _cone_base(settings: HardcasesSettings, pieces: Pieces, progress: Progress) -> _Base:
     scene = balls()
     clean = pieces("scan", partial(cone_scan, scene))
     noisy = clean.with_noise(NOISE_FREE_EXPOSURE_S, settings.seed)
@@ -303,13 +303,13 @@ def _reconstruct(scan: Scan, grid: VolumeGrid, method: str) -> Volume:
     )
 
 
-def _sound(settings: Settings, pieces: Pieces, name: str, method: str) -> None:
+def _sound(settings: HardcasesSettings, pieces: Pieces, name: str, method: str) -> None:
     """What a method makes of the sound scan of this name."""
     _BASES[name](settings, pieces.within(name), silent).sound(method)
 
 
 def _case(
-    settings: Settings, pieces: Pieces, name: str, base: _Base | None = None
+    settings: HardcasesSettings, pieces: Pieces, name: str, base: _Base | None = None
 ) -> list[dict[str, Any]]:
     """A row for each method; without ``base``, its sound scan, this is computed or read first."""
     base = base or _BASES[CASES[name].base](settings, pieces.within(CASES[name].base), silent)
@@ -348,7 +348,7 @@ def _case(
 
 
 def _anatomy(
-    settings: Settings, pieces: Pieces, name: str, base: _Base | None = None
+    settings: HardcasesSettings, pieces: Pieces, name: str, base: _Base | None = None
 ) -> list[dict[str, Any]]:
     """See :func:`recon.study.hardcases.anatomies.anatomy_rows`."""
     base = base or _BASES["plaque"](settings, pieces.within("plaque"), silent)

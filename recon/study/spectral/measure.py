@@ -63,7 +63,7 @@ _PICTURED_KEV = (40.0, 52.0, 70.0)
 
 
 @dataclass(frozen=True)
-class Settings(StudySettings):
+class SpectralSettings(StudySettings):
     """Settings of the study; the quick ones take an eighth of the views, one realisation, no wrong
     calibrations.
 
@@ -153,7 +153,7 @@ class Seen:
 
 
 def measure(
-    settings: Settings, progress: Progress = silent, folder: str | Path | None = None
+    settings: SpectralSettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
     """Scan, decompose, reconstruct, label, in resumable pieces."""
     s, pieces, spent = settings, Pieces(folder, settings), time.process_time()
@@ -202,7 +202,7 @@ def measure(
 
 
 def _noisy(
-    s: Settings, pieces: Pieces, k: int, scan: SpectralScan | None = None
+    s: SpectralSettings, pieces: Pieces, k: int, scan: SpectralScan | None = None
 ) -> tuple[Tensor, list[Tensor], dict[str, Any]]:
     """FBP of a realisation, its line integrals if MBIR needs them, and what is told of its rays."""
     scan = scan or SpectralScan(s, pieces=pieces)

@@ -192,7 +192,7 @@ def test_a_study_gives_the_same_report(name, processes, tmp_path):
 
 
 def run_tiny_with(name, settings, folder):
-    made = registry.part(name).Settings(**settings)
+    made = registry.settings_class(name)(**settings)
     registry.run(name, made, pieces=folder).save(folder)
 
 

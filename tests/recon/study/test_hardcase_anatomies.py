@@ -5,7 +5,7 @@ import torch
 
 from recon.evaluate.anatomies import ANATOMIES
 from recon.study.hardcases.anatomies import METHODS, _painted, anatomy_verdict
-from recon.study.hardcases.measure import Settings
+from recon.study.hardcases.measure import HardcasesSettings
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.recovery import recovered_contrast
 
@@ -51,10 +51,10 @@ def divmodded(flat, shape):
 
 
 def test_settings_of_disease():
-    assert set(Settings().anatomy_methods) == set(METHODS)
+    assert set(HardcasesSettings().anatomy_methods) == set(METHODS)
     for wrong in ({"anatomies": ("unicorn",)}, {"anatomy_methods": ("fbp",)}, {"draws": -1}):
         with pytest.raises(ValueError, match=r"unicorn|fbp|draws"):
-            Settings(**wrong)
+            HardcasesSettings(**wrong)
 
 
 @pytest.mark.extended

@@ -13,8 +13,8 @@ from tiny_studies import TINY, assert_report_is_whole
 from recon.analytic.exact_noise import roi_adjoints, roi_covariance, voxel_covariance
 from recon.analytic.inset import InsetFbp
 from recon.study.noise import (
+    NoiseSettings,
     RoiStatistics,
-    Settings,
     few_run_tables,
     measured_table,
     pair_differences,
@@ -44,7 +44,7 @@ def test_realisations_without_reconstruction_are_those_of_fbp(tiny):
     assert check["largest_difference_in_sd"] < 0.03
 
 
-AXES = Settings(**TINY["noise"]).axes
+AXES = NoiseSettings(**TINY["noise"]).axes
 
 
 def test_joint_covariance_holds_the_covariances_of_every_setting(measured):

@@ -191,7 +191,7 @@ BAD = {
 )
 def test_bad_settings(name, change, match):
     with pytest.raises(ValueError, match=match):
-        registry.part(name).Settings(**change)
+        registry.settings_class(name)(**change)
 
 
 def test_changes_from_the_command_line():
@@ -203,7 +203,7 @@ def test_changes_from_the_command_line():
 
 def test_names_that_are_known_unloaded_are_those_that_there_are():
     for name in registry.STUDIES:
-        kind = registry.part(name).Settings
+        kind = registry.settings_class(name)
         assert setting_names(registry.folder(name)) == tuple(f.name for f in fields(kind) if f.init)
     assert case_names() == tuple(CASES)
 

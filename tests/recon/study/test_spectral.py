@@ -11,7 +11,7 @@ import torch
 from tiny_studies import assert_report_is_whole
 
 from recon.study.report import render
-from recon.study.spectral import Settings, calibration, checks
+from recon.study.spectral import SpectralSettings, calibration, checks
 from recon.study.spectral.calibration import (
     SHOWN_KEV,
     CalibrationError,
@@ -140,7 +140,7 @@ def test_twice_the_error_costs_more(tiny):
     zero = vmi(torch.zeros_like(lines[0]), scan.basis, [70.0])
     ratio = float((large - zero).mean() / (small - zero).mean())
     assert ratio == pytest.approx(2.0, abs=0.05)
-    names = [e.name for e in calibration_cases(Settings(), 8)]
+    names = [e.name for e in calibration_cases(SpectralSettings(), 8)]
     assert len(set(names)) == len(names) == 17
 
 
