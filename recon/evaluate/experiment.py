@@ -26,9 +26,9 @@ from recon.evaluate.draws import Draws
 from recon.evaluate.energies import BINS, EnergyDraws, with_bins
 from recon.evaluate.estimates import Record, ReferenceNoise, records_of
 from recon.evaluate.measure import BLOCK, Measurement, Reader, Readings, kept_as
-from recon.evaluate.methods import Method, method_of
+from recon.evaluate.methods import Method, MethodLike, method_of
 from recon.evaluate.task import GroundTruth, Task
-from recon.evaluate.tasks import read_task
+from recon.evaluate.tasks import TaskLike, read_task
 from recon.jobs import execute
 from recon.jobs.execute import Job, Unportable
 from recon.jobs.store import Store
@@ -80,8 +80,8 @@ class Evaluation:
 
 @checked
 def evaluate(
-    tasks: Any,
-    methods: Any,
+    tasks: TaskLike | Sequence[TaskLike],
+    methods: MethodLike | Sequence[MethodLike],
     *,
     exposures_s: Any = None,
     n: int = 20,
@@ -572,7 +572,7 @@ def _finished(
 
 @checked
 def export_scans(
-    tasks: Any,
+    tasks: TaskLike | Sequence[TaskLike],
     folder: str | Path,
     *,
     exposures_s: Any = None,

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from recon.api import reconstruct
 from recon.evaluate.measure import volume_of
-from recon.evaluate.methods import Method, method_of, noise_of
+from recon.evaluate.methods import Method, MethodLike, method_of, noise_of
 from recon.evaluate.without_truth import MeasuredDraw, as_slices
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.recovery import recovered_contrast
@@ -208,7 +208,7 @@ def recovery_table(found: Sequence[ContrastRecovery]) -> str:
 def contrast_recovery(
     scan: Scan,
     grid: VolumeGrid,
-    methods: object = "mbir",
+    methods: MethodLike | Sequence[MethodLike] = "mbir",
     balls: Sequence[InsertedBall] = (InsertedBall(1.0, 100.0),),
     *,
     places: Sequence[Sequence[float]] | None = None,

@@ -33,7 +33,7 @@ import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -126,7 +126,12 @@ class Method:
         return self.made or (Method, tuple(getattr(self, f.name) for f in fields(self)))
 
 
-def method_of(spec: Any) -> Method:
+MethodLike: TypeAlias = str | Method | Callable[[Scan, VolumeGrid], Tensor | Volume]
+"""What a method is given by: its name (``"fbp:soft"``), itself, or a function of a scan and a grid
+that gives a volume in HU."""
+
+
+def method_of(spec: MethodLike) -> Method:
     """A method from its name, see the module; a :class:`Method` or a function of ``(scan, grid)``
     as it is.
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from importlib import resources
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import torch
@@ -75,7 +76,12 @@ def task_text(name: str) -> str:
     return (_FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
 
 
-def read_task(what: Any) -> Task:
+TaskLike: TypeAlias = str | os.PathLike[str] | Task
+"""What a task is given by: its name (:data:`recon.evaluate.names.TASKS`), a YAML file, or
+itself."""
+
+
+def read_task(what: TaskLike) -> Task:
     """A task from its name (:data:`TASKS`), from a YAML file, or as it is.
 
     Raises:

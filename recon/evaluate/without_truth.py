@@ -25,7 +25,7 @@ from torch import Tensor
 
 from recon.api import reconstruct
 from recon.evaluate.measure import volume_of
-from recon.evaluate.methods import Method, method_of, noise_of
+from recon.evaluate.methods import Method, MethodLike, method_of, noise_of
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.equal_resolution import noise_at_equal_resolution
 from torchpcct.metrics.half_split import HalfSplit, halves
@@ -90,7 +90,13 @@ class MeasuredDraw:
 
 @checked
 def evaluate_scans(
-    scans: Any, grid: VolumeGrid, methods: Any, region: Any = None, *, n: int = 1, seed: int = 0
+    scans: Any,
+    grid: VolumeGrid,
+    methods: MethodLike | Sequence[MethodLike],
+    region: Any = None,
+    *,
+    n: int = 1,
+    seed: int = 0,
 ) -> list[Record]:
     """Methods on two scans of one object, or on one scan of the whole detector in two halves of its
     views.
