@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Unpack, overload
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar, Unpack, overload
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from recon.names import split_method
 from recon.result import Result, tested
 from torchpcct.checks.defects import dead_readings, repair_defects
 from torchpcct.checks.readings import reading_warnings
+from torchpcct.devices import device_of, same_device
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.scan_grid import finite_cells
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
 __all__ = ["MethodOptions", "reconstruct"]
 
 _LOG = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 _STARVED = 0.5
 """More zero counts than this, and the logarithm no longer describes the data: FBP and PWLS would be
@@ -94,7 +97,7 @@ def reconstruct(
     method: str = ...,
     *,
     progress: Callable[[float], None] | None = ...,
-    device: str | torch.device = ...,
+    device: str | torch.device | None = ...,
     **options: Unpack[MethodOptions],
 ) -> Volume: ...
 @overload
@@ -104,7 +107,7 @@ def reconstruct(
     method: str = ...,
     *,
     progress: Callable[[float], None] | None = ...,
-    device: str | torch.device = ...,
+    device: str | torch.device | None = ...,
     **options: Unpack[MethodOptions],
 ) -> list[Volume]: ...
 
@@ -116,7 +119,7 @@ def reconstruct(
     method: str = "fbp",
     *,
     progress: Callable[[float], None] | None = None,
-    device: str | torch.device = "cpu",
+    device: str | torch.device | None = None,
     **options: Unpack[MethodOptions],
 ) -> Volume | list[Volume]:
     """Reconstruct a scan on a grid, in HU (water reads 0).
@@ -136,7 +139,12 @@ def reconstruct(
             (:mod:`recon.evaluate.methods`): ``"fbp:soft"``,
             ``"mbir:fidelity=1,prior=perona-malik"``.
         progress: called with the finished fraction, 0…1.
-        device: where the returned volumes lie.
+        device: where it is computed and where the volumes lie, a name such as ``"cuda"``; None:
+            where the scan lies (:meth:`torchpcct.Scan.to`). On another device than the CPU the
+            report says under ``device`` which one, and under ``on_cpu`` what was computed on the
+            CPU all the same: tests and repair of the readings, tests of what a volume leaves of
+            them, the fit of an inset's FFT model, and what is drawn of a vessel. All else runs on
+            the device, with Triton's kernels.
         options: of the method (:class:`MethodOptions`).
 
     Readings that no object can cause (dead or hot cells, dead views, lost readings:
@@ -161,7 +169,8 @@ def reconstruct(
 
     Raises:
         ValueError: an unknown method, kernel or option value, a grid outside the field of view, a
-            starved scan.
+            starved scan; a device that does not exist, has too little memory, or has no kernels for
+            the scan; scans or a ``problem`` on another device.
         TypeError: ``scan`` is no :class:`torchpcct.Scan`, or an option does not exist.
 
     Example:
@@ -183,6 +192,7 @@ def reconstruct(
         )
     if not isinstance(grid, VolumeGrid) or (grid.ndim != 3 and scans[0].geometry.has_rows):
         raise ValueError(f"grid must be a (z, y, x) VolumeGrid, got {grid!r}")
+    there = _device(scans, device)
     for s in scans:
         require_light(s.zero_fraction)
     name, named = split_method(method)
@@ -201,15 +211,16 @@ def reconstruct(
             )
         named["network"] = Mbir.load(named.pop("weights"), network=named.pop("network", None))
     chosen: dict[str, Any] = {**named, **options}
-    whole = [_prepared(s) for s in scans]
-    scans = [s for s, _ in whole]
+    whole = [_prepared(_here(s)) for s in scans]
+    scans = [_there(s, there) for s, _ in whole]
     for text in {text for _, texts in whole for text in texts}:
         _LOG.warning("%s", text)
     methods: dict[str, Any] = {"fbp": _fbp, "pwls": reconstruct_pwls, "mbir": _mbir}
     volumes: list[Volume] = []
     told: set[str] = set()
     began = time.perf_counter()
-    for batch in methods[name](scans, grid, progress or (lambda _: None), **chosen):
+    found_of = methods[name](scans, grid, progress or (lambda _: None), **chosen)
+    for batch in _within_memory(found_of, there):
         seconds = round((time.perf_counter() - began) / len(batch), 3)
         for solution in batch:
             s, before = whole[len(volumes)]
@@ -219,14 +230,62 @@ def reconstruct(
                 "cells_mm": finite_cells(s.geometry),
                 "dead_readings": dead_readings(s),
             }
+            if there.type != "cpu":
+                report |= {"device": str(there), "on_cpu": _on_cpu(name, s, report)}
             report["warnings"] = [*before, *found]
             for text in found:
                 if text not in told:
                     _LOG.warning("%s", text)
             told.update(found)
-            volumes.append(Volume(volume.to(device), grid, report, unit=s.unit))
+            volumes.append(Volume(volume, grid, report, unit=s.unit))
         began = time.perf_counter()
     return volumes[0] if isinstance(scan, Scan) else volumes
+
+
+def _device(scans: Sequence[Scan], device: Any) -> torch.device:
+    """Where to compute: on the device that is named, else where the scans lie."""
+    if device is not None:
+        return device_of(device)
+    return same_device(**{f"scan {i}": s.counts for i, s in enumerate(scans)})
+
+
+def _here(scan: Scan) -> Scan:
+    """The scan on the CPU, where its readings are tested and repaired."""
+    if scan.device.type == "cpu":
+        return scan
+    return once(scan, "on the CPU", lambda: scan.to("cpu"))
+
+
+def _there(scan: Scan, device: torch.device) -> Scan:
+    """The scan on a device, kept with the one that it is a copy of."""
+    if scan.device == device:
+        return scan
+    return once(scan, "moved", lambda: scan.to(device), str(device))
+
+
+def _within_memory(batches: Iterator[T], device: torch.device) -> Iterator[T]:
+    """The same batches; a device that is full is told of in one sentence."""
+    try:
+        yield from batches
+    except torch.OutOfMemoryError as error:
+        said = str(error).partition(". ")[0]
+        raise ValueError(
+            f"{device} has too little memory ({said}): take larger or fewer voxels, fewer volumes "
+            'at a time, or device="cpu"'
+        ) from error
+
+
+def _on_cpu(method: str, scan: Scan, report: Mapping[str, Any]) -> list[str]:
+    """What was computed on the CPU although the rest was not."""
+    found = ["tests and repair of the readings"]
+    if method != "fbp":
+        if scan.geometry.has_rows and "work_grid" not in report:
+            found.append("fit of the FFT model of an inset")
+        if "vessel" in report or "tissues" in report:
+            found.append("what is drawn of the vessel")
+        if not scan.noise_free:
+            found.append("test of what the volume leaves of the readings")
+    return found
 
 
 def _prepared(scan: Scan) -> tuple[Scan, list[str]]:

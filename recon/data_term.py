@@ -142,6 +142,23 @@ class Quadratic:
             return 0.0
         return float(to_hu(torch.tensor(self.level, dtype=torch.float64), self.mu_ref))
 
+    def to(self, device: torch.device | str) -> Quadratic:
+        """The same on a device; its operator must be able to move, as
+        :class:`recon.gram.gram.Gram` is."""
+        operator: Any = self.operator
+        if self.b.device == torch.device(device):
+            return self
+        moved: dict[str, Any] = {
+            name: None if value is None else value.to(device)
+            for name, value in (
+                ("b", self.b),
+                ("scale", self.scale),
+                ("unit", self.unit),
+                ("energy", self.energy),
+            )
+        }
+        return replace(self, operator=operator.to(device), **moved)
+
     def apply(self, u: Tensor) -> Tensor:
         """H u, ``(batch, *grid.shape)``."""
         return self.operator.apply(u) * self._each(self.scale)

@@ -38,7 +38,7 @@ from recon.api import reconstruct, require_light
 from recon.jobs import execute
 from recon.jobs.sources import source_digest
 from recon.jobs.store import Store
-from recon.least_squares.memory import available_bytes, pwls_bytes, resident_bytes
+from recon.least_squares.memory import pwls_bytes, resident_bytes
 from recon.least_squares.qggmrf import QGGMRF
 from recon.metal import metal_warnings
 from torchpcct.checks.defects import (
@@ -52,6 +52,7 @@ from torchpcct.checks.defects import (
 )
 from torchpcct.checks.readings import reading_warnings
 from torchpcct.detector_window import DetectorWindow
+from torchpcct.devices import available_bytes
 from torchpcct.formats.scans import adapted, open_scan, own_options
 from torchpcct.formats.volume_slabs import CHUNK, SlabFile, check_slab_name
 from torchpcct.geometry import Geometry, VolumeGrid, beam

@@ -87,6 +87,9 @@ class DetectorWindow:
         """What each reading of the window has at its cell: ``(..., rows, columns)`` of the whole
         detector to ``(..., views, rows, columns)``."""
         kept = cells[..., self.first_row : self.first_row + self.rows, :]
+        if cells.device.type != "cpu":  # one kernel instead of one a view
+            columns = torch.from_numpy(self.column_indices).to(cells.device)
+            return kept[..., columns].movedim(-2, -3).contiguous()
         out = cells.new_empty((*cells.shape[:-2], *self.shape))
         # Whole runs of columns: 20 times as fast as an index into the cells.
         for view, first in enumerate(self.first_column.tolist()):

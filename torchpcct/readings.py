@@ -429,11 +429,25 @@ def log_bias(mean: Tensor) -> Tensor:
             more.
     """
     known, bias = _log_bias()
+    if mean.device.type != "cpu":
+        return _interpolated((mean + 0.5 / _AVERAGED).log(), known, bias, math.log(MANY))
     # The logarithm of the estimate is biased, too: ½ a count in those that it was made of.
     m = mean + 0.5 / _AVERAGED
     dim = m < MANY
     found = np.interp(np.log(m[dim].double().clamp(FEWEST, MANY).numpy()), known, bias)
     return torch.zeros_like(mean).masked_scatter_(dim, torch.from_numpy(found).to(mean.dtype))
+
+
+def _interpolated(
+    at: Tensor, known: NDArray[np.float64], values: NDArray[np.float64], end: float
+) -> Tensor:
+    """``numpy.interp`` with torch, 0 from ``end`` on: on any device, for all readings alike."""
+    x, y = (torch.from_numpy(v).to(at.device) for v in (known, values))
+    place = at.double().clamp(known[0], known[-1])
+    right = torch.searchsorted(x, place).clamp(1, len(known) - 1)
+    low, high = y[right - 1], y[right]
+    found = low + (high - low) * (place - x[right - 1]) / (x[right] - x[right - 1])
+    return torch.where(at < end, found, 0.0).to(at.dtype)
 
 
 def smoothed(values: Tensor, dead: Tensor | None, rows: bool) -> Tensor:
@@ -464,7 +478,7 @@ def _filtered(values: Tensor, axis: int, weights: tuple[int, ...]) -> Tensor:
     """Weighted mean over neighbours along an axis; the outermost value is repeated."""
     n, half = values.shape[axis], len(weights) // 2
     out = torch.zeros_like(values)
-    index = torch.arange(n)
+    index = torch.arange(n, device=values.device)
     for k, w in enumerate(weights):
         out.add_(
             values.index_select(axis, (index + k - half).clamp(0, n - 1)), alpha=w / sum(weights)

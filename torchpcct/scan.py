@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchpcct import counting_noise as noise
 from torchpcct.detector_window import DetectorWindow
+from torchpcct.devices import device_of, same_device
 from torchpcct.files import read_hdf5
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
 from torchpcct.readings import (
@@ -38,6 +39,8 @@ __all__ = ["Scan"]
 
 NOISE_FREE_EXPOSURE_S = 1.0
 """The exposure that the expected readings of a noise-free scan stand for."""
+_TENSORS = ("counts", "air", "surround", "quantum", "flux", "dead")
+"""Members that lie on a device."""
 
 
 @dataclass(frozen=True)
@@ -219,6 +222,24 @@ class Scan:
             f"Scan({size} {what}, {noise}, {dead} dead{part}, volumes in {self.unit}\n     "
             f"{self.geometry!r})"
         )
+
+    @property
+    def device(self) -> torch.device:
+        """Where the readings lie, and where reconstructions of them compute."""
+        return self.counts.device
+
+    @checked
+    def to(self, device: str | torch.device) -> Scan:
+        """The same scan with its tensors on a device; itself where they lie there already.
+
+        Raises:
+            ValueError: no such device. TypeError: no name of one.
+        """
+        target = device_of(device)
+        if self.device == target:
+            return self
+        moved = {name: getattr(self, name) for name in _TENSORS}
+        return replace(self, **{k: v.to(target) for k, v in moved.items() if v is not None})
 
     @property
     def noise_free(self) -> bool:
@@ -524,7 +545,7 @@ class Scan:
             if self.noise_free or self.window is not None
             else smoothed(self.counts, self.dead, rows)
         )
-        quantum = torch.ones(1) if self.quantum is None else self.quantum
+        quantum = self.counts.new_ones(1) if self.quantum is None else self.quantum
         p = (self._at_window(self.air) / torch.maximum(mean, quantum / 2)).log_()
         if self.flux is not None:
             p += self._per_view(self.flux.log())
@@ -584,12 +605,13 @@ class Scan:
         """Mean over the views of readings ``(views, r, c)`` on the window, ``(rows, columns)``."""
         w, g = self.window, self.geometry
         assert w is not None
-        total = torch.zeros((w.rows, g.columns), dtype=torch.float64)
-        read = torch.zeros(g.columns, dtype=torch.float64)
-        for values, at in zip(readings, torch.from_numpy(w.column_indices), strict=True):
+        double: Any = {"dtype": torch.float64, "device": readings.device}
+        total, read = torch.zeros((w.rows, g.columns), **double), torch.zeros(g.columns, **double)
+        columns = torch.from_numpy(w.column_indices).to(readings.device)
+        for values, at in zip(readings, columns, strict=True):
             total.index_add_(-1, at, values.double())
-            read.index_add_(0, at, torch.ones(len(at), dtype=torch.float64))
-        out = torch.full((g.rows, g.columns), float(readings.double().mean()), dtype=torch.float64)
+            read.index_add_(0, at, torch.ones(len(at), **double))
+        out = torch.full((g.rows, g.columns), float(readings.double().mean()), **double)
         rows = slice(w.first_row, w.first_row + w.rows)
         out[rows] = torch.where(read > 0, total / read.clamp(min=1.0), out[rows])
         return out.to(readings.dtype)
@@ -678,6 +700,7 @@ def _check(scan: Scan) -> None:
                 "cells before"
             )
     choice("unit", scan.unit, UNITS)
+    same_device(**{name: getattr(scan, name) for name in _TENSORS})
     if scan.dead is not None and scan.dead.shape != scan.counts.shape:
         raise ValueError(
             f"dead has shape {tuple(scan.dead.shape)}, counts {tuple(scan.counts.shape)}"
@@ -703,10 +726,10 @@ def _check_kinds(scan: Scan) -> None:
         values = getattr(scan, name)
         if values is None and name in ("surround", "quantum"):
             continue
-        if not isinstance(values, Tensor) or not values.is_floating_point():
+        if not isinstance(values, Tensor) or values.dtype not in (torch.float32, torch.float64):
             found = values.dtype if isinstance(values, Tensor) else type(values).__name__
             raise TypeError(
-                f"{name} must be a floating point tensor, got {found}: use "
+                f"{name} must be a tensor of float32 or float64, got {found}: use "
                 "torch.as_tensor(…).float()"
             )
     if scan.seed is not None:

@@ -115,10 +115,11 @@ def at_slices(sinogram: Tensor, slices: Floats, grid: VolumeGrid) -> Tensor:
         )
     below = np.minimum(place.astype(int), max(slices.size - 2, 0))
     share = torch.from_numpy(place - below).to(sinogram)[:, None, None]
-    above = torch.from_numpy(np.minimum(below + 1, slices.size - 1))
-    return torch.lerp(
-        sinogram[..., torch.from_numpy(below), :, :], sinogram[..., above, :, :], share
+    low, high = (
+        sinogram.index_select(-3, torch.from_numpy(at).to(sinogram.device))
+        for at in (below, np.minimum(below + 1, slices.size - 1))
     )
+    return torch.lerp(low, high, share)
 
 
 def _axis_of(low: float, high: float, pitch: float) -> tuple[int, float]:
@@ -262,7 +263,8 @@ def _resampled(sinogram: Tensor, circle: IdealCircle) -> Tensor:
         for i in range(along.shape[0]):
             for j in range(across.shape[0]):
                 weight = torch.from_numpy(along[i] * across[j]).to(sinogram)
-                one = one + weight * flat[..., torch.from_numpy(lower[i]), torch.from_numpy(low[j])]
+                r, c = (torch.from_numpy(n).to(flat.device) for n in (lower[i], low[j]))
+                one = one + weight * flat[..., r, c]
         out.append(one.reshape(*sinogram.shape[:-3], v.size, u.size))
     return torch.stack(out, -3)
 

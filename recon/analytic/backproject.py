@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.detector_window import DetectorWindow
+from torchpcct.devices import require_triton
 from torchpcct.geometry import Beam, Geometry, ParallelBeam, VolumeGrid, beam
 from torchpcct.projector.cpu.symmetry import (
     Orbits,
@@ -249,7 +251,113 @@ class BackprojectionPlan:
 
     def __call__(self, filtered: Tensor) -> Tensor:
         """:meth:`forward`, differentiable, of data on any device."""
-        return apply_linear(filtered.cpu(), self.forward, self.transpose).to(filtered.device)
+        return apply_linear(filtered, self.forward, self.transpose)
+
+    def _there(self, like: Tensor) -> tuple[Any, ...]:
+        """What :mod:`recon.analytic.backproject_triton` is told beside the data: on the device and
+        in the dtype of ``like``."""
+        axes, center = self.grid.axes, self.grid.center
+        c, s, (cy, cx) = self.cosines, self.sines, center[-2:]
+        across = cy * c - cx * s + self.shifts[:, 1]
+        depth = self.sod - self.shifts[:, 0] - (cx * c + cy * s)
+        unit, reach = self.scale * (self.sdd or 1.0), 0.0
+        if self.kind == _KIND["parallel"]:
+            position = across
+        elif self.kind == _KIND["flat"]:
+            position = across / depth
+        else:
+            position = np.arctan2(across, depth)
+            y, x = (axis[[0, -1]] - m for axis, m in zip(axes[-2:], (cy, cx), strict=True))
+            y, x = (v.ravel()[:, None] for v in np.meshgrid(y, x, indexing="ij"))
+            corners = np.arctan2(across + y * c - x * s, depth - (x * c + y * s))
+            reach = math.tan(0.5 * float(np.abs(corners - position).max()))
+        position = position * unit + self.starts
+        whole = np.floor(position)
+        table = np.stack([c, s, across, depth, position - whole, self.shifts[:, 2]], 1)
+        atan = _atan_polynomial(reach, unit, like.dtype)
+        numbers = [
+            number
+            for axis, middle, pitch in zip(axes, center, self.grid.spacing, strict=True)
+            for number in (axis[0] - middle, pitch)
+        ]
+        numbers += [self.sod, unit]
+        if self.cone:
+            numbers[0] = axes[0][0]
+            numbers += [self.sdd * self.row_scale, self.row_start]
+        return (
+            torch.from_numpy(table).to(like),
+            torch.from_numpy(whole.astype(np.int32)).to(like.device),
+            torch.from_numpy(np.array(atan)).to(like),
+            torch.from_numpy(np.array(numbers)).to(like),
+            self.kind,
+        )
+
+    def _forward_there(self, data: Tensor) -> Tensor:
+        """:meth:`forward` by Triton's kernels."""
+        require_triton(data.device, "filtered backprojection")
+        from recon.analytic import backproject_triton as kernels  # Triton may be missing
+
+        n = 3 if self.cone else 2
+        lead, shape = data.shape[:-n], data.shape[-n:]
+        out = data.new_empty((math.prod(lead), *self.grid.shape))
+        if out.shape[0]:
+            work = kernels.backproject_volume if self.cone else kernels.backproject_plane
+            work(data.reshape(-1, *shape).contiguous(), out, *self._there(data))
+            if self.mask is not None:
+                out.masked_fill_(torch.from_numpy(self.mask).to(out.device), 0.0)
+        return out.view(*lead, *self.grid.shape)
+
+    def _transpose_there(self, volume: Tensor) -> Tensor:
+        """:meth:`transpose` with torch alone: view by view the same weights are added up, without
+        atomics (``index_put_`` sorts), so that the sums have a fixed order."""
+        w, n = self.window, self.grid.ndim
+        lead = volume.shape[:-n]
+        cells = (w.rows, w.columns) if self.cone else (w.columns,)
+        out = volume.new_zeros((math.prod(lead), w.views, math.prod(cells)))
+        flat = volume.reshape(len(out), -1)
+        if self.mask is not None:
+            outside = torch.from_numpy(np.broadcast_to(self.mask, self.grid.shape).ravel().copy())
+            flat = flat.masked_fill(outside.to(flat.device), 0.0)
+        batch = torch.arange(len(out), device=flat.device)[:, None]
+        double: Any = {"dtype": torch.float64, "device": flat.device}
+        z, y, x = (
+            torch.from_numpy(axis.copy()).to(**double)
+            for axis in (self.grid.axes if self.cone else (np.zeros(1), *self.grid.axes))
+        )
+        for v in range(w.views):
+            for cell, weight in self._neighbours(v, z[:, None, None], y[:, None], x):
+                values = flat * weight.to(flat)
+                where = batch.expand(values.shape), cell.expand(values.shape)
+                out[:, v].index_put_(where, values, accumulate=True)
+        return out.view(*lead, w.views, *cells)
+
+    def _neighbours(
+        self, view: int, z: Tensor, y: Tensor, x: Tensor
+    ) -> Iterator[tuple[Tensor, Tensor]]:
+        """Of one view the readings that voxels are interpolated between, flattened, and their
+        weights, ``(voxels,)`` each."""
+        c, s = float(self.cosines[view]), float(self.sines[view])
+        toward, aside, up = (float(shift) for shift in self.shifts[view])
+        across, depth = y * c - x * s + aside, (self.sod - toward) - (x * c + y * s)
+        distance = depth
+        if self.kind == _KIND["parallel"]:
+            position, height = across, torch.ones_like(across)
+            weight = height
+        else:
+            if self.kind == _KIND["curved"]:
+                distance = torch.hypot(across, depth)
+                position = self.sdd * torch.atan2(across, depth)
+            else:
+                position = self.sdd * across / depth
+            height, weight = self.sdd / distance, (self.sod / distance).square()
+        columns = _between(position * self.scale + float(self.starts[view]), self.window.columns)
+        rows = [(torch.zeros_like(z, dtype=torch.int64), torch.ones_like(z))]
+        if self.cone:
+            rows = _between((z + up) * height * self.row_scale + self.row_start, self.window.rows)
+        for row, along in rows:
+            for column, share in columns:
+                cell = (row * self.window.columns + column).flatten()
+                yield cell, (weight * share * along).flatten()
 
     def forward(
         self, data: Tensor, slices: tuple[int, int] | None = None, first_row: int = 0
@@ -258,7 +366,12 @@ class BackprojectionPlan:
 
         Of a cone beam, with ``slices`` (first, stop) only these of the volume, from the rows of the
         window that start at ``first_row`` and hold :meth:`rows`: the same bits as in the whole.
+        On another device than the CPU, where ``slices`` are not known, Triton's kernels do it.
         """
+        if data.device.type != "cpu":
+            if slices is not None:
+                raise ValueError("slab by slab FBP computes on the CPU: move the data there")
+            return self._forward_there(data)
         from recon.analytic import backproject_kernels as kernels  # numba loads with its first use
 
         n = 3 if self.cone else 2
@@ -366,6 +479,8 @@ class BackprojectionPlan:
     def transpose(self, volume: Tensor) -> Tensor:
         """``(..., [z,] y, x)`` to ``(..., views, [rows,] columns)``: the exact transpose of
         :meth:`forward`."""
+        if volume.device.type != "cpu":
+            return self._transpose_there(volume)
         from recon.analytic import backproject_kernels as kernels  # numba loads with its first use
 
         n = self.grid.ndim
@@ -399,6 +514,15 @@ class BackprojectionPlan:
                     out.numpy(),
                 )
         return out.view(*lead, *shape)
+
+
+def _between(position: Tensor, cells: int) -> list[tuple[Tensor, Tensor]]:
+    """The two cells about each place and their shares; the outermost cell is repeated."""
+    at = position.clamp(0.0, cells - 1.0)
+    low = at.floor().clamp_max(max(cells - 2, 0))
+    share = at - low
+    left = low.long()
+    return [(left, 1.0 - share), ((left + 1).clamp_max(cells - 1), share)]
 
 
 def _shifts(motion: Any, cosines: Any, sines: Any, axes: int) -> NDArray[np.float64]:

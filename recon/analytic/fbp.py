@@ -21,9 +21,10 @@ from recon.analytic.any_orbit import at_slices, rebin_to_circle
 from recon.analytic.backproject import BackprojectionPlan, check_data, data_shape
 from recon.analytic.coverage import check_rows, refuse_helix
 from recon.analytic.detector_edges import Rows, continued, cut_off, mirrored
-from recon.analytic.filter_plan import FilterPlan, kernel_names
+from recon.analytic.filter_plan import CHUNK_BYTES, FilterPlan, kernel_names
 from torchpcct.angles import view_steps
 from torchpcct.detector_window import DetectorWindow, footprint
+from torchpcct.devices import require_room
 from torchpcct.geometry import Beam, Geometry, VolumeGrid, beam, view_step
 from torchpcct.projector.operator import apply_linear
 from torchpcct.readings import interpolate_dead
@@ -72,8 +73,8 @@ def filter_sinogram(
     rounding.
 
     Args:
-        sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64. Data of
-            another device are filtered on the CPU and sent back.
+        sinogram: line integrals ``(..., views, [rows,] columns)``, float32 or float64, filtered
+            where they lie.
         geometry: parallel, fan or cone beam.
         kernel: reconstruction kernel (:data:`recon.names.KERNELS`) or a sequence of them.
         window: return only these readings of every view (rows and columns); default: all. Its rows
@@ -104,8 +105,8 @@ def filter_sinogram(
         whole if window is None else window,
     )
     flat = not geometry.has_rows
-    given = (sinogram.unsqueeze(-2) if flat else sinogram).cpu()  # the kernels are CPU code
-    out = apply_linear(given, plan.forward, plan.transpose).to(sinogram.device)
+    given = sinogram.unsqueeze(-2) if flat else sinogram
+    out = apply_linear(given, plan.forward, plan.transpose)
     out = out.squeeze(-2) if flat else out
     kernel_axis = -3 if flat else -4
     return out.movedim(kernel_axis, 0) if several else out.squeeze(kernel_axis)
@@ -384,7 +385,19 @@ class FbpPlan:
 
     def __call__(self, lines: Tensor) -> list[Tensor]:
         """:meth:`backprojected` of line integrals of the whole detector."""
-        return self.backprojected(self.filtered(self.complete(lines).lines))
+        rows = self.complete(lines).lines
+        if rows.device.type != "cpu":
+            require_room(self._bytes(rows), rows.device, "FBP")
+        return self.backprojected(self.filtered(rows))
+
+    def _bytes(self, lines: Tensor) -> int:
+        """Largest memory of :meth:`__call__` on a device, besides the completed rows ``lines``."""
+        axes = len(self.completed.shape)
+        batch = math.prod(lines.shape[:-axes]) * len(kernel_names(self.kernel)[0])
+        # Filtered readings and a copy with the rows innermost; volumes, the last in both orders.
+        numbers = 2 * math.prod(self.window.shape)
+        numbers += sum(grid.voxels for grid in self.grids) + max(g.voxels for g in self.grids)
+        return batch * lines.element_size() * numbers + 4 * CHUNK_BYTES
 
 
 class Fbp(nn.Module):

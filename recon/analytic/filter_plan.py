@@ -135,9 +135,58 @@ class FilterPlan:
         rows = np.broadcast_to(self.cosine, (self.window_out.rows, self.geometry.columns))
         return [self.angular.astype(number), np.ascontiguousarray(rows, dtype=number)]
 
+    def _placed(self, v0: int, v1: int, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the views ``v0 … v1 - 1`` the place of every reading in the common frame, ``(v, 1,
+        width_in)``, and its weight, ``(v, R, width_in)``, on the device of ``like``."""
+        a = self.window_in
+        angular, cosine = self._weights(like)
+        columns = a.column_indices[v0:v1]
+        views = np.arange(v0, v1)[:, None]
+        factor = torch.from_numpy(angular[views, columns if angular.shape[1] > 1 else 0])
+        rows = torch.from_numpy(np.array(cosine)).to(like.device)
+        at = torch.from_numpy(columns).to(like.device)
+        weight = factor.to(like.device)[:, None] * rows[:, at].transpose(0, 1)
+        place = self._offset[v0:v1, None] + np.arange(a.columns)
+        return torch.from_numpy(place).to(like.device)[:, None], weight
+
+    def _forward_there(self, data: Tensor) -> Tensor:
+        """:meth:`forward` with torch alone, on any device."""
+        a, b = self.window_in, self.window_out
+        lead = data.shape[:-3]
+        data = data.reshape(math.prod(lead), *data.shape[-3:])
+        out = data.new_empty((data.shape[0], len(self.kernels), a.views, b.rows, b.columns))
+        responses, r0 = self._responses(data), b.first_row - a.first_row
+        for v0 in range(0, a.views, self.chunk):
+            v1 = min(v0 + self.chunk, a.views)
+            place, weight = self._placed(v0, v1, data)
+            for source, target in zip(data, out, strict=True):
+                frame = data.new_zeros((v1 - v0, b.rows, self._length))
+                rows = source[v0:v1, r0 : r0 + b.rows] * weight
+                frame.scatter_(-1, place.expand_as(rows), rows)
+                self._convolve(frame, responses, target[:, v0:v1])
+        return out.view(*lead, *out.shape[1:])
+
+    def _transpose_there(self, gradient: Tensor) -> Tensor:
+        """:meth:`transpose` with torch alone, on any device."""
+        a, b = self.window_in, self.window_out
+        lead = gradient.shape[:-4]
+        gradient = gradient.reshape(math.prod(lead), *gradient.shape[-4:])
+        out = gradient.new_zeros((gradient.shape[0], a.views, a.rows, a.columns))
+        responses, r0 = self._responses(gradient), b.first_row - a.first_row
+        for v0 in range(0, a.views, self.chunk):
+            v1 = min(v0 + self.chunk, a.views)
+            place, weight = self._placed(v0, v1, gradient)
+            for source, target in zip(gradient, out, strict=True):
+                frame = self._correlate(source[:, v0:v1], responses)
+                rows = frame.gather(-1, place.expand(*frame.shape[:-1], a.columns))
+                target[v0:v1, r0 : r0 + b.rows] += rows * weight
+        return out.view(*lead, *out.shape[1:])
+
     def forward(self, data: Tensor) -> Tensor:
         """Weight and filter: ``(..., V, rows_in, width_in)`` to ``(..., K, V, rows_out,
-        width_out)``."""
+        width_out)``, by numba's kernels on the CPU and by torch on any other device."""
+        if data.device.type != "cpu":
+            return self._forward_there(data)
         from recon.analytic.filter_kernels import align  # numba loads with its first use
 
         a, b = self.window_in, self.window_out
@@ -177,6 +226,8 @@ class FilterPlan:
     def transpose(self, gradient: Tensor) -> Tensor:
         """Transpose of :meth:`forward`: ``(..., K, V, rows_out, width_out)`` to ``(..., V,
         rows_in, width_in)``."""
+        if gradient.device.type != "cpu":
+            return self._transpose_there(gradient)
         from recon.analytic.filter_kernels import unalign  # numba loads with its first use
 
         a, b = self.window_in, self.window_out

@@ -160,6 +160,11 @@ def _run(options: argparse.Namespace, parser: Parser) -> int:
         from recon.study.study import ProgressBars
 
         progress = ProgressBars(not options.no_progress and sys.stderr.isatty())
+        if options.device != "cpu" and options.command != "reconstruct":
+            raise ValueError(
+                f"--device {options.device}: reconstruct computes on a GPU, {options.command} "
+                "does not; use --device cpu"
+            )
         if options.device == "cuda" and not _cuda():
             raise ValueError("--device cuda: PyTorch finds no CUDA device here; use --device cpu")
         return options.run(options, progress) or 0

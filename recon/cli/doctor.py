@@ -37,6 +37,11 @@ for name in sys.argv[1:]:
         said = (str(error).strip().splitlines() or [type(error).__name__])[0]
     print("LOADED", name, said, flush=True)
 """
+_CHECKED_ON = (
+    "GPU kernels: checked by Triton's interpreter, not yet timed on a card "
+    "(tests/bench/gpu.py does)"
+)
+"""What is known of the kernels for cards."""
 _AGAIN = "install torchpcct again, in its folder: pip install --force-reinstall --no-deps ."
 
 
@@ -152,13 +157,14 @@ def _gpu() -> str:
 
     if not torch.cuda.is_available():
         return (
-            f"none that torch can use (torch {torch.__version__}); everything runs on the processor"
+            f"none that torch can use (torch {torch.__version__}); everything runs on the "
+            f"processor. {_CHECKED_ON}"
         )
     if not _installed("triton"):
         raise ValueError("torch finds one, but the GPU kernels need triton: pip install triton")
     about = torch.cuda.get_device_properties(0)
     versions = f"CUDA {torch.version.cuda}, triton {metadata.version('triton')}"
-    return f"{about.name}, {about.total_memory / 2**30:.0f} GiB, {versions}"
+    return f"{about.name}, {about.total_memory / 2**30:.0f} GiB, {versions}. {_CHECKED_ON}"
 
 
 def _cache() -> str:

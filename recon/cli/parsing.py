@@ -232,7 +232,7 @@ def command(
             "--device",
             str,
             None,
-            "where volumes are kept (default cpu)",
+            "where to reconstruct (default cpu)",
             {"choices": ("cpu", "cuda"), "default": "cpu"},
         ),
         FORCE,

@@ -662,6 +662,11 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
     from torchpcct.formats.scans import open_scan
 
     if slabs:
+        if arguments.device != "cpu":
+            raise ValueError(
+                "--memory works slab by slab, on the CPU: leave out --memory or "
+                f"--device {arguments.device}"
+            )
         _reconstruct_slabs(arguments, options, progress)
         return
     scan = open_scan(arguments.scan, **reader_options(arguments))

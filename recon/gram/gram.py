@@ -161,7 +161,7 @@ class Gram:
         projector: the exact operator A (:class:`torchpcct.projector.Projector`) of the inset,
             usually with a window; it is not kept.
         weights: W, inverse variances of the line integrals, ``range_shape``, finite and ≥ 0 (zeros
-            are dead readings).
+            are dead readings). The model is fitted on the CPU and lies where they do.
         nodes: positions at which the exact impulse response is taken: 1 (shift invariant, fastest),
             5 (linear in position) or 9 (quadratic, most accurate). Each costs about one pass of the
             projector; the result can be kept for all noise realisations of a scan and, with
@@ -192,6 +192,8 @@ class Gram:
         self._basis = self._polynomials(len(self._spectra)).to(self.dtype)
         self._factor: Tensor | None = None
         self._information: dict[tuple[float, float], float] = {}
+        if weights.device.type != "cpu":  # fitted here, applied there
+            self.__dict__ |= self.to(weights.device).__dict__
 
     # -- construction ------------------------------------------------------------------------------
 
@@ -396,12 +398,12 @@ def information_at(
         mu_per_hu: 1 HU in mm⁻¹.
     """
     hy, hx = spacing[-2:]
-    double: Any = {"dtype": torch.float64, "device": "cpu"}
+    double: Any = {"dtype": torch.float64, "device": spectra.device}
     f = torch.hypot(
         torch.fft.fftfreq(period[0], hy, **double)[:, None],
         torch.fft.rfftfreq(period[1], hx, **double)[None, :],
     )
-    spectra = spectra.double().cpu()
+    spectra = spectra.double()
     wanted = min(frequency, HIGHEST_PER_VOXEL / max(hy, hx))
     distance = (f - wanted).abs() + torch.where(f == 0, math.inf, 0.0)
     # Rounding must not decide about frequencies on the ring's edge: the unit of length would, too.

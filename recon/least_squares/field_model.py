@@ -25,6 +25,7 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -238,7 +239,7 @@ def _central(seen: Tensor) -> tuple[int, ...]:
         along = (torch.arange(n, device=seen.device) - (n - 1) / 2).square()
         distance = distance + along.reshape(-1, *[1] * (seen.dim() - 1 - axis))
     nearest = torch.where(enough, distance, torch.full_like(distance, math.inf)).argmin()
-    return tuple(int(k) for k in torch.unravel_index(nearest, seen.shape))
+    return tuple(int(k) for k in np.unravel_index(int(nearest), tuple(seen.shape)))
 
 
 def _periodic(response: Tensor, at: tuple[int, ...]) -> Tensor:

@@ -60,6 +60,15 @@ def field_prior(voxel_mm: float, dimensions: int = 3) -> QGGMRF:
     return DEFAULT_PRIOR.stretched(voxel_mm / REFERENCE_VOXEL_MM, dimensions)
 
 
+def require_device(scan: Scan, device: torch.device) -> None:
+    """Refuse a scan that lies on another device than the problem it is given to (ValueError)."""
+    if scan.device != device:
+        raise ValueError(
+            f"the scan lies on {scan.device} and the problem that was made for it on {device}: "
+            f'move the scan, scan.to("{device}"), or make the problem of the one that was moved'
+        )
+
+
 def is_whole_field(scan: Scan, grid: VolumeGrid) -> bool:
     """Whether PWLS treats the grid as the whole field: always but for an inset of a cone beam."""
     geometry = scan.geometry
@@ -106,7 +115,7 @@ class FieldProblem:
             )
         self.warnings = check_rows(geometry, grid)
         self.grid, self.geometry, self.mu_ref = grid, geometry, scan.linearisation.mu_ref
-        self.unit = scan.unit
+        self.unit, self.device = scan.unit, scan.device
         self._asked = grid.slice if self.plane else grid
         self.work = self._asked
         self.projector = Projector(geometry, self.work)
@@ -117,7 +126,7 @@ class FieldProblem:
 
     def _misses(self, lines: Tensor, dead: Tensor | None) -> bool:
         """Whether readings that do not meet the grid see something."""
-        met = self.projector(torch.ones(self.projector.domain_shape)) > 0
+        met = self.projector(lines.new_ones(self.projector.domain_shape)) > 0
         known = torch.ones_like(lines, dtype=torch.bool) if dead is None else ~dead
         if not bool((known & met).any()):
             return False
@@ -139,6 +148,7 @@ class FieldProblem:
         """
         if scan.geometry != self.geometry:
             raise ValueError("this scan has another geometry than the one the problem was made for")
+        require_device(scan, self.device)
         y, w = scan.line_integrals(), scan.weights()
         n = len(self.geometry.shape)
         pairs = zip(y.reshape(-1, *y.shape[-n:]), w.reshape(-1, *w.shape[-n:]), strict=True)
@@ -210,12 +220,14 @@ class FieldProblem:
             yield Result(self.hu([r.volume for r in results]), report, found, tests)
 
     def residual_test(self, y: Tensor, w: Tensor, x: Tensor) -> ResidualTest:
-        """Whether a volume ``work.shape`` in mm⁻¹ explains the readings of one slice."""
+        """Whether a volume ``work.shape`` in mm⁻¹ explains the readings of one slice; the tests
+        themselves are computed on the CPU."""
         from torchpcct.metrics.residual_test import residual_test  # loads scipy.stats
 
         fitted = self.projector(x.to(y))
         rows = (lambda v: v.unsqueeze(-2)) if self.plane else (lambda v: v)
-        return residual_test(rows(y - fitted), rows(w), rows(fitted), unknowns=self.work.voxels)
+        tested = [rows(v).cpu() for v in (y - fitted, w, fitted)]
+        return residual_test(*tested, unknowns=self.work.voxels)
 
 
 def larger_grid(grid: VolumeGrid, geometry: Any) -> VolumeGrid:

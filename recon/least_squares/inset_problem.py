@@ -17,7 +17,7 @@ from recon.analytic.inset import require_inside, require_same_surround, static_f
 from recon.data_term import Projected, Quadratic
 from recon.gram.gram import Gram
 from recon.least_squares.field_model import FieldModel
-from recon.least_squares.field_problem import is_whole_field
+from recon.least_squares.field_problem import is_whole_field, require_device
 from recon.least_squares.memory import require_memory
 from recon.least_squares.pwls import MinimiseOptions, PwlsOptions, data_model, minimise
 from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
@@ -78,6 +78,7 @@ class InsetProblem:
         self.outer = scan.window or DetectorWindow.full(scan.geometry)
         check_rows(scan.geometry, grid)
         self.mu_ref, self.unit = scan.linearisation.mu_ref, scan.unit
+        self.device = scan.device
         self.warnings: list[str] = []
         self._nodes = nodes
         self._around: UnknownSurround | None = None
@@ -189,6 +190,7 @@ class InsetProblem:
             raise ValueError(
                 "this scan has another geometry or window than the one the problem was made for"
             )
+        require_device(scan, self.device)
         if self._around is not None:
             return self._around.take_off(scan.line_integrals(), self.level)
         if self._background is None:
@@ -224,7 +226,7 @@ class InsetProblem:
         return Quadratic(
             self.model if isinstance(self.model, Gram) else self._projected(1.0),
             b,
-            torch.full((len(b),), float(exposure_s), dtype=torch.float64),
+            b.new_full((len(b),), float(exposure_s), dtype=torch.float64),
             self.grid.spacing,
             self.mu_ref,
             self.level,
@@ -251,7 +253,8 @@ class InsetProblem:
                 f"the scans of one batch must have one exposure, got {sorted(exposures)} s"
             )
         (exposure,) = exposures
-        return replace(term, operator=self._projected(exposure), scale=torch.ones(len(term.b)))
+        scale = torch.ones(len(term.b), device=term.b.device)
+        return replace(term, operator=self._projected(exposure), scale=scale)
 
     @undisturbed
     def residual_test(self, scan: Scan, volume: Tensor, data: Tensor | None = None) -> ResidualTest:
@@ -271,7 +274,8 @@ class InsetProblem:
             self.weights * float(scan.exposure_s or NOISE_FREE_EXPOSURE_S) * torch.exp(-fitted)
         )
         y = self.data(scan) if data is None else data
-        return residual_test(y - fitted, weights, fitted, unknowns=self.grid.voxels)
+        tested = [v.cpu() for v in (y - fitted, weights, fitted)]  # its statistics are SciPy's
+        return residual_test(*tested, unknowns=self.grid.voxels)
 
     @undisturbed
     def solve(

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from recon.gram.impulse_response import slice_reach
+from torchpcct.devices import available_bytes
 from torchpcct.geometry import Geometry, VolumeGrid
-from torchpcct.memory import free_bytes
 from torchpcct.validate import whole
 
 VOLUMES = 21
@@ -19,13 +19,6 @@ VOLUMES = 21
 their images, the prior's and the transform's temporaries, the spectra of a whole field."""
 SINOGRAMS = 3
 """Arrays of the data's size besides the arguments: weighted data, projection, their product."""
-
-
-def available_bytes(device: torch.device) -> int:
-    """Memory that can still be allocated: of the device, of the container, or of the machine."""
-    if device.type == "cuda":
-        return int(torch.cuda.mem_get_info(device)[0])
-    return free_bytes()
 
 
 def resident_bytes() -> int:
@@ -74,10 +67,11 @@ def require_memory(A: Any, batch: int, like: Tensor, memory: int | None) -> None
     need = pwls_bytes(A, batch, like.dtype, like.device)
     free = available_bytes(like.device) if memory is None else memory
     if need > free:
+        where = "" if like.device.type == "cpu" else f" on {like.device}"
         raise ValueError(
             f"PWLS of {batch} volume(s) {tuple(A.domain_shape)} from data {tuple(A.range_shape)} "
-            f"needs {need / 2**30:.2f} GiB, {free / 2**30:.2f} GiB are available: take larger or "
-            "fewer voxels, float32, fewer volumes at a time, or bin the readings"
+            f"needs {need / 2**30:.2f} GiB, {free / 2**30:.2f} GiB are available{where}: take "
+            "larger or fewer voxels, float32, fewer volumes at a time, or bin the readings"
         )
 
 

@@ -40,6 +40,7 @@ from recon.least_squares.model_solver import ModelSolver, line_search
 from recon.least_squares.qggmrf import QGGMRF, BoundPrior
 from recon.result import Result
 from torchpcct.detector_window import footprint
+from torchpcct.devices import same_device
 from torchpcct.validate import checked, number, whole
 
 __all__ = ["PwlsOptions", "minimise", "pwls"]
@@ -207,7 +208,7 @@ def pwls(
 
     Raises:
         ValueError: shapes that do not fit, data that are not finite, weights that are negative or
-            all 0, a tolerance ≤ 0, too little memory.
+            all 0, a tolerance ≤ 0, too little memory, data on two devices.
         TypeError: data or weights that are not float tensors.
 
     Example:
@@ -223,6 +224,8 @@ def pwls(
     """
     started = time.perf_counter()
     rays = tuple(A.range_shape)
+    if isinstance(y, Tensor) and isinstance(weights, Tensor):
+        same_device(y=y, weights=weights, start=start)
     channels = weights.dim() > len(rays)
     if channels:
         check_information(weights, rays)
@@ -252,7 +255,7 @@ def pwls(
     term = Quadratic(
         Projected(A, weighed, model),
         b.reshape(-1, *volume),
-        torch.ones(lead.numel()),
+        torch.ones(lead.numel(), device=b.device),
         A.grid.spacing,
         1000.0 * mu_per_hu,
         energy=energy.reshape(-1),
@@ -412,7 +415,7 @@ def minimise(
     determined = (
         gram.determined
         if isinstance(gram, FieldModel)
-        else torch.ones(shape[-len(spacing) :], dtype=torch.bool)
+        else torch.ones(shape[-len(spacing) :], dtype=torch.bool, device=b.device)
     )
     approach, beyond = Approach(x, determined), Approach(x, ~determined)
     misfit: float | None = None

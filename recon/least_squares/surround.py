@@ -19,6 +19,7 @@ from __future__ import annotations
 import hashlib
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -82,7 +83,7 @@ class UnknownSurround:
         self.coarse = self._first.grid
         self._left = Projector(self._second.inner, self.coarse)
         self._around = Projector(geometry, self.coarse, window)
-        self._last: tuple[bytes, Tensor] | None = None
+        self._last: tuple[Any, Tensor] | None = None
 
     def volume(self, lines: Tensor) -> Tensor:
         """The whole field without the inset's details, ``coarse.shape`` mm⁻¹, from line integrals
@@ -98,7 +99,7 @@ class UnknownSurround:
         Raises:
             ValueError: the rows end inside the object.
         """
-        of = hashlib.blake2b(lines.contiguous().numpy().data).digest()
+        of = _told(lines)
         if self._last is not None and self._last[0] == of:
             return self._last[1]
         if any(cut_off(lines, self.geometry, angular_weights(self.geometry))):
@@ -110,7 +111,7 @@ class UnknownSurround:
         fine = fbp(lines, self.geometry, self.grid)
         around = lines.clone()
         w = self.window
-        columns = torch.from_numpy(w.column_indices)[:, None].expand(w.shape)
+        columns = torch.from_numpy(w.column_indices).to(lines.device)[:, None].expand(w.shape)
         rows = around[:, w.first_row : w.first_row + w.rows]
         rows.scatter_add_(-1, columns, -self.projector(fine - _sides(fine).mean()))
         x = self._first.fbp(self._first.joined(around))
@@ -238,6 +239,15 @@ class _Field:
         return torch.nan_to_num(fbp(extended, self._extended, self.grid, outside=outside))
 
 
+def _told(lines: Tensor) -> Any:
+    """What line integrals are told apart by: a hash or, of those on a device, from which nothing
+    is to be copied, the sums of the bits of all views."""
+    if lines.device.type == "cpu":
+        return hashlib.blake2b(lines.contiguous().numpy().data).digest()
+    bits = lines.contiguous().view(torch.int32 if lines.dtype == torch.float32 else torch.int64)
+    return tuple(bits.flatten(1).sum(1, dtype=torch.int64).tolist())
+
+
 def _rounded(value: float) -> int:
     """The nearest whole number, upwards from a half whatever the rounding of the last digit."""
     return math.floor(value + 0.5 + TIE)
@@ -270,7 +280,7 @@ def resampled(volume: Tensor, grid: VolumeGrid, onto: VolumeGrid) -> Tensor:
         index = np.clip(np.floor((at - own[0]) / h + 0.5), 0, volume.shape[axis] - 1).astype(
             np.int64
         )
-        volume = volume.index_select(axis, torch.from_numpy(index))
+        volume = volume.index_select(axis, torch.from_numpy(index).to(volume.device))
     return volume
 
 

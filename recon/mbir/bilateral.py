@@ -23,6 +23,7 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpcct.devices import require_triton
 from torchpcct.threads import run
 from torchpcct.validate import number, shaped, whole
 
@@ -107,7 +108,8 @@ class _Bilateral(torch.autograd.Function):
         # Where there is no noise (and so no threshold) every difference is an edge.
         scale = 1.0 / threshold.detach().float().clamp_min(_LEAST)
         offsets, weights = _offsets(reach, step)
-        if u.device.type == "cuda":
+        if u.device.type != "cpu":
+            require_triton(u.device, "the bilateral filter")
             from recon.mbir import bilateral_triton  # where there is a GPU
 
             near = (
@@ -137,7 +139,7 @@ class _Bilateral(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> Any:
         values, g, scale, offsets, weights, out, total, dtype = ctx.kept
         slope = grad.detach().float().contiguous()
-        if grad.device.type == "cuda":
+        if grad.device.type != "cpu":
             from recon.mbir import bilateral_triton
 
             found = bilateral_triton.backward(values, g, scale, offsets, weights, out, total, slope)

@@ -365,7 +365,7 @@ def _term(
     return Quadratic(
         gram,
         b[None],
-        torch.ones(1),
+        torch.ones(1, device=b.device),
         (voxel_mm,) * 3,
         problem.mu_ref,
         energy=torch.stack(energies).sum()[None],

@@ -237,13 +237,14 @@ class Mbir:
         """Around what is known; where nothing is drawn, or what is drawn is objected to, without
         it."""
         scans = range(len(term.b))
-        found = [known.drawn(term.part([k]), self.fidelity) for k in scans]
+        # What is known is fitted on the CPU.
+        found = [known.drawn(term.part([k]).to("cpu"), self.fidelity) for k in scans]
         why = [one.why for one in found]
         images = {k: one.image for k, one in enumerate(found) if one.image is not None}
         volumes: dict[int, Tensor] = {}
         if images:
             part = normal.part(list(images))
-            t = part.of_hu(torch.stack(list(images.values())))
+            t = part.of_hu(torch.stack(list(images.values())).to(part.b))
             # Once what is known is taken off, four turns do what eight do: 0.7 HU rms apart on
             # the paper's plaque.
             network = self.model.network
@@ -253,7 +254,7 @@ class Mbir:
             u = t + self.solution(part.less(t), **quick)
             hu = part.hu(u.detach())
             for k, own, volume in zip(images, u, hu, strict=True):
-                why[k] = found[k].objection(volume)
+                why[k] = found[k].objection(volume.cpu())
                 if not why[k]:
                     volumes[k] = own
         plain = [k for k in scans if k not in volumes]
@@ -296,6 +297,19 @@ class Mbir:
         """
         other = copy.copy(self)
         other.parts = {**self.parts, "prior": _ready(prior)}
+        return other
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same method with its weights on a device; itself where they are there already."""
+        held = [self.model, *(p for p in (self.parts.get("prior"),) if isinstance(p, nn.Module))]
+        target = torch.device(device)
+        tensors = [t for m in held for t in (*m.parameters(), *m.buffers())]
+        if all(t.device == target for t in tensors):
+            return self
+        other = copy.copy(self)
+        other.model = copy.deepcopy(self.model).to(target)
+        if len(held) > 1:
+            other.parts = {**self.parts, "prior": copy.deepcopy(held[1]).to(target)}
         return other
 
     def with_known(self, known: Known | None) -> Self:

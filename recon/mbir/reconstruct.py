@@ -73,7 +73,7 @@ def reconstruct_mbir(
     """
     if prior is not None:
         network = network.with_prior(prior) if network is not None else Mbir(prior=prior)
-    network = network or Mbir.load()
+    network = (network or Mbir.load()).to(scans[0].device)
     if fidelity is not None:
         network = network.with_fidelity(fidelity)
     if known is not None:

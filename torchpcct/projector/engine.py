@@ -1,11 +1,10 @@
-"""Which passes a tensor takes: the CPU's, or on CUDA the Triton counterparts, once they have
-reproduced the CPU's."""
+"""Which passes a tensor takes: the CPU's, or on any other device the Triton counterparts, once they
+have reproduced the CPU's there. Nothing is copied from one to the other."""
 
 from __future__ import annotations
 
 import itertools
 import math
-import warnings
 import weakref
 from functools import cached_property
 from typing import Any, Protocol
@@ -15,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpcct.devices import require_triton
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.kernel_cache import announce_compilation
 from torchpcct.projector.cuda import passes as cuda
@@ -22,8 +22,8 @@ from torchpcct.projector.tables import Tables, VectorTables
 
 _TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-10}
 """Relative error up to which a device's kernels agree with the CPU's."""
-_CHECKED: dict[tuple[str, torch.dtype], bool] = {}
-"""Whether a device's kernels agree, by device and dtype."""
+_CHECKED: dict[tuple[str, torch.dtype], float] = {}
+"""What was found of a device's kernels, by device and kind of scan, and dtype."""
 
 
 ENGINES: weakref.WeakValueDictionary[int, Engine] = weakref.WeakValueDictionary()
@@ -116,21 +116,15 @@ class Engine:
         if batch == 0:
             return x.new_zeros((*lead, *outer))
         flat = x.detach().reshape(batch, *inner)
-        own = isinstance(self.tables, Tables)  # vectors have CPU passes only
-        if (
-            own
-            and x.device.type == "cuda"
-            and cuda.available()
-            and self._trusted(x.device, x.dtype)
-        ):
-            passes = self.on(x.device)
-            return (passes.adjoint(flat) if transposed else passes.forward(flat)).reshape(
-                *lead, *outer
-            )
-        return self._on_cpu(flat, transposed).reshape(*lead, *outer).to(x.device)
+        if x.device.type == "cpu":
+            found = self._on_cpu(flat, transposed)
+        else:
+            passes = self._trusted_on(x.device, x.dtype)
+            found = passes.adjoint(flat) if transposed else passes.forward(flat)
+        return found.reshape(*lead, *outer)
 
     def _on_cpu(self, x: Tensor, transposed: bool) -> Tensor:
-        array = x.cpu().contiguous().numpy()
+        array = x.contiguous().numpy()
         announce_compilation()
         result = self.cpu.adjoint(array) if transposed else self.cpu.forward(array)
         return torch.from_numpy(np.ascontiguousarray(result))
@@ -142,9 +136,35 @@ class Engine:
             return self.cpu.workspace(batch, itemsize)
         return cuda.workspace(self.tables, batch, itemsize)
 
-    def agrees(self, device: torch.device, dtype: torch.dtype) -> bool:
-        """True if the device's kernels reproduce the CPU's on random data of this scan, both
-        ways; warns if not."""
+    def _trusted_on(self, device: torch.device, dtype: torch.dtype) -> cuda.GpuPasses:
+        """The passes on a device, once they have reproduced the CPU's there.
+
+        Raises:
+            ValueError: the scan has none, or Triton is missing. RuntimeError: they compute
+                something else.
+        """
+        if not isinstance(self.tables, Tables):
+            raise ValueError(
+                "a scan given by vectors that no circular scan describes has passes on the CPU "
+                f"only, and the data lie on {device}: move them with .cpu()"
+            )
+        require_triton(device, "the projector")
+        kind = type(self.tables.geometry)
+        key = (f"{device} {kind.__name__}", dtype)
+        if key not in _CHECKED:
+            _CHECKED[key] = Engine(Tables(*_SMALL[kind])).deviation(device, dtype)
+        if not _CHECKED[key] <= _TOLERANCE[dtype]:
+            raise RuntimeError(
+                f"the Triton projector on {device} differs from the CPU's by {_CHECKED[key]:.1e} "
+                f"(allowed {_TOLERANCE[dtype]:.0e}): check the installed triton version, or move "
+                "the data to the CPU with .cpu()"
+            )
+        return self.on(device)
+
+    def deviation(self, device: torch.device, dtype: torch.dtype) -> float:
+        """Relative difference of the device's kernels from the CPU's on random data of this
+        scan, the larger one of both directions."""
+        worst = 0.0
         generator = torch.Generator().manual_seed(0)
         passes = self.on(device)
         for transposed in (False, True):
@@ -155,25 +175,8 @@ class Engine:
             error = float(
                 (found - expect).norm() / expect.norm().clamp_min(torch.finfo(dtype).tiny)
             )
-            if not error <= _TOLERANCE[dtype]:
-                warnings.warn(
-                    f"the Triton projector on {device} differs from the CPU's by {error:.1e} "
-                    f"(allowed {_TOLERANCE[dtype]:.0e}); the CPU's is used instead. Check the "
-                    "installed triton version.",
-                    RuntimeWarning,
-                    stacklevel=2,
-                )
-                return False
-        return True
-
-    def _trusted(self, device: torch.device, dtype: torch.dtype) -> bool:
-        """:meth:`agrees`, checked once per device, dtype and kind of scan, on a scan of a few
-        views and voxels."""
-        kind = type(self.tables.geometry)
-        key = (f"{device} {kind.__name__}", dtype)
-        if key not in _CHECKED:
-            _CHECKED[key] = Engine(Tables(*_SMALL[kind])).agrees(device, dtype)
-        return _CHECKED[key]
+            worst = max(worst, error if math.isfinite(error) else math.inf)
+        return worst
 
 
 _ANGLES = (0.1, 1.9, 4.0)

@@ -256,8 +256,9 @@ class Projector(Operator):
     differentiable any number of times and work under ``torch.func``. NaN and Inf in the input reach
     the output (a NaN may also reach readings that share a grid line with it). ``torch.compile``
     and, within the process, ``torch.export`` take a pass as one operation. The module has no
-    parameters and no state. On CUDA the Triton kernels are used if Triton is installed and their
-    first-use check against the CPU passes; otherwise the data travel to the CPU and back.
+    parameters and no state. Tensors on a GPU take the Triton kernels, after a check against the CPU
+    at their first use; nothing travels to the CPU. They are refused without Triton, where that
+    check fails, and of vectors that no circular scan describes.
 
     Args:
         geometry: ``ParallelBeam`` or ``FanBeam`` with a 2-D grid, ``ConeBeam`` with a 3-D grid; or
@@ -278,7 +279,8 @@ class Projector(Operator):
     Raises:
         TypeError: an argument of the wrong kind, an input that is not float32 or float64.
         ValueError: geometry, grid, window and motion that do not fit together, a source inside the
-            grid, an input of the wrong shape.
+            grid, an input of the wrong shape, or on a device that has no passes for the scan.
+        RuntimeError: the device's kernels compute something else than the CPU's.
     """
 
     def __init__(

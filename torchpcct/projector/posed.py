@@ -129,7 +129,16 @@ class PosedEngine:
 
     def apply(self, x: Tensor, transposed: bool) -> Tensor:
         """One pass, ``(..., *domain_shape)`` to ``(..., *range_shape)`` or, ``transposed``, back,
-        with gradients by x and the tensors."""
+        with gradients by x and the tensors.
+
+        Raises:
+            ValueError: data on another device than the CPU.
+        """
+        if x.device.type != "cpu":
+            raise ValueError(
+                "passes with gradients by motion and geometry are on the CPU only, and the data "
+                f"lie on {x.device}: move them with .cpu(), or give motion and geometry as numbers"
+            )
         inner, outer = self.shapes(transposed)
         lead = x.shape[: x.dim() - len(inner)]
         if math.prod(lead) == 0:
@@ -165,14 +174,14 @@ def _check_motion(motion: Tensor, views: int, axes: int) -> None:
 
 
 def _array(x: Tensor) -> Any:
-    return np.ascontiguousarray(x.detach().cpu().numpy())
+    return np.ascontiguousarray(x.detach().numpy())
 
 
 def _run(method: Any, *args: Tensor, like: Tensor) -> Tensor:
     announce_compilation()
     with unswitched():
         found = torch.from_numpy(method(*(_array(x) for x in args)))
-        return found.to(like.device, like.dtype)
+        return found.to(like.dtype)
 
 
 class _Pass(torch.autograd.Function):

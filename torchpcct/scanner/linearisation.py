@@ -10,6 +10,7 @@ materials keep the small nonlinearity that no water correction removes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -163,10 +164,7 @@ class WaterLinearisation:
             )
         if p.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"p must be float32 or float64, got {p.dtype}")
-        flat = p.detach().cpu().contiguous().reshape(-1, columns)
-        if window is None:
-            first = np.zeros(1, np.int64)
-        else:
+        if window is not None:
             if tuple(p.shape[-3:-1]) != (window.views, window.rows):
                 raise ValueError(
                     f"p must have the shape (..., {window.views}, {window.rows}, {columns}) on "
@@ -177,6 +175,12 @@ class WaterLinearisation:
                     f"the window reaches beyond the {self.scale.size} columns of the water "
                     "correction"
                 )
+        if p.device.type != "cpu":
+            return self._evaluate_there(p.detach(), window, slope)
+        flat = p.detach().contiguous().reshape(-1, columns)
+        if window is None:
+            first = np.zeros(1, np.int64)
+        else:
             first = np.repeat(window.first_column, window.rows)
         out = torch.empty_like(flat)
         work = flat.shape[1] * 3 * self.coefficients.shape[1]
@@ -192,7 +196,28 @@ class WaterLinearisation:
             out.numpy(),
             operations=work,
         )
-        return out.reshape(p.shape).to(p.device)
+        return out.reshape(p.shape)
+
+    def _evaluate_there(self, p: Tensor, window: DetectorWindow | None, slope: bool) -> Tensor:
+        """What :func:`~torchpcct.scanner.linearisation_kernel.evaluate` computes, with torch on
+        the device of ``p``."""
+
+        def of_columns(values: NDArray[np.float64]) -> Tensor:
+            if window is not None:  # (views, 1, columns)
+                values = values[window.column_indices][:, None]
+            return torch.from_numpy(np.ascontiguousarray(values)).to(p.device)
+
+        scale = of_columns(self.scale)
+        x = (p / scale).clamp_(0.0, 1.0)
+        value, local = torch.zeros_like(x), torch.zeros_like(x)
+        for power in reversed(range(self.coefficients.shape[1])):
+            local = local.mul_(x).add_(value)
+            value = value.mul_(x).add_(of_columns(self.coefficients[:, power]))
+        bend = value + x * local
+        if slope:
+            return torch.where(p.isnan(), math.nan, bend).to(p.dtype)
+        inside = scale * x
+        return (inside * value + (p - inside) * bend).to(p.dtype)
 
     def apply(self, p: Tensor, window: DetectorWindow | None = None) -> Tensor:
         """Water-equivalent line integrals ``mu_ref t``.
