@@ -1,11 +1,25 @@
 # mypy: ignore-errors
 """Triton counterparts of the CPU kernels for CUDA: the same weights, gathered on both sides, so
-without atomics.
+without atomics and in a fixed order.
 
-Forward: one program per (view, column), lanes along the rows; it walks the slabs. Adjoint: one
-program per slab and voxels along it, lanes along z (plane: along the slab); it walks the segments,
-finds by bisection the columns that touch its voxels, and adds their overlaps. A plane is a volume
-of one slice without heights.
+**Places.** Where the edge of a cell crosses slab r, ``t = p + q r`` in voxels, is computed in whole
+numbers of 2⁻ᵇ (``bits``), exactly; only what is left beside a voxel becomes a number of the data's
+dtype. So float32 is relative to the voxel, and float64 is not needed, which cards for graphics
+compute 64 times as slowly.
+
+**Forward.** Plane: lanes are neighbouring columns of one view, which walk the slabs of their own
+main axis, in an image that is turned for one of them so that neighbours read neighbours. Cone: one
+program per (view, column), lanes along the rows; a second depth layer is read only by cells that
+share layers.
+
+**Adjoint.** Plane: lanes are the voxels of a slab. Cone: one program per voxel column, lanes along
+z. It walks the segments. All edges of a segment pass through the source, so their slope ``q`` tells
+them apart whatever the slab (of parallel rays, ``p``): a table of equal steps of it says with which
+column a voxel begins, with one look-up instead of a bisection. From there on the columns are
+followed until they are past the voxel.
+
+A number that is no tensor is float32 to a compiled kernel: all that are not whole come in tensors
+of the data's dtype.
 """
 
 from __future__ import annotations
@@ -15,22 +29,97 @@ import triton.language as tl
 
 
 @triton.jit
+def _edges(lines, cell):
+    """p and q of both edges of a cell."""
+    at = lines + cell * 4
+    return tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3)
+
+
+@triton.jit
+def _crossing(p0, q0, p1, q1, r, bits, ulp, number: tl.constexpr):
+    """Of a cell in slab r the lower end of its overlap: whole voxel and what lies beside it; and
+    its width, all in voxels."""
+    ta, tb = p0 + q0 * r, p1 + q1 * r
+    low = tl.minimum(ta, tb)
+    k = low >> bits
+    part = (low - (k << bits)).to(number) * ulp
+    width = (tl.maximum(ta, tb) - low).to(number) * ulp
+    return k.to(tl.int32), part, width
+
+
+@triton.jit
 def _read(base, zeta, last):
     """Linear interpolation of knots 0…last at ``zeta``, clamped."""
     zeta = tl.minimum(tl.maximum(zeta, 0.0), last)
     k = tl.minimum(zeta.to(tl.int32), last - 1)
-    part = zeta - k
     low = tl.load(base + k)
-    return low + part.to(low.dtype) * (tl.load(base + k + 1) - low)
+    return low + (zeta - k) * (tl.load(base + k + 1) - low)
 
 
 @triton.jit
-def project_kernel(
-    lines,
+def project_plane(
+    images,
     out,
-    cells,
-    pose,
+    lines,
+    depths,
     axes,
+    numbers,
+    bits,
+    count,
+    ny,
+    nx,
+    most,
+    views,
+    columns,
+    blocks,
+    PARALLEL: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """``images``: ``(batch, 2, ny * nx)``, the second one turned; ``out``: ``(batch, views,
+    columns)``; ``count``: voxels that a cell touches in a slab at most."""
+    number: tl.constexpr = out.dtype.element_ty
+    view, batch = tl.program_id(0) // blocks, tl.program_id(1).to(tl.int64)
+    column = (tl.program_id(0) % blocks) * BLOCK + tl.arange(0, BLOCK)
+    inside = column < columns
+    cell = view * columns + tl.minimum(column, columns - 1)
+    axis = tl.load(axes + cell)
+    slabs, width = tl.where(axis == 0, ny, nx), tl.where(axis == 0, nx, ny)
+    l0, l1, path = (
+        tl.load(depths + cell * 4),
+        tl.load(depths + cell * 4 + 1),
+        tl.load(depths + cell * 4 + 2),
+    )
+    ulp, nearest = tl.load(numbers), tl.load(numbers + 1)
+    image = images + (batch * 2 + axis) * (ny * nx)
+    p0, q0, p1, q1 = _edges(lines, cell)
+    acc = tl.zeros((BLOCK,), dtype=number)
+    for r in tl.range(0, most):
+        seen = inside & (r < slabs)
+        if not PARALLEL:
+            seen = seen & (l0 + l1 * r > nearest)
+        k0, part, wide = _crossing(p0, q0, p1, q1, r, bits, ulp, number)
+        first = tl.maximum(k0, 0)
+        scale = path / wide
+        for m in tl.range(0, count):
+            k = first + m
+            beside = (k - k0).to(number)
+            w = tl.minimum(part + wide, beside + 1.0) - tl.maximum(part, beside)
+            good = seen & (k < width) & (w > 0)
+            value = tl.load(image + r * width + k, mask=good, other=0.0)
+            acc += tl.where(good, scale * w, 0.0) * value
+    tl.store(out + (batch * views + view) * columns + column, acc, mask=inside)
+
+
+@triton.jit
+def project_cone(
+    sums,
+    out,
+    lines,
+    depths,
+    axes,
+    heights,
+    numbers,
+    bits,
     ny,
     nx,
     knots,
@@ -38,89 +127,160 @@ def project_kernel(
     views,
     rows,
     columns,
-    z0,
-    dz,
-    row0,
-    row_pitch,
-    layer,
-    nearest,
-    layered_below,
-    PLANE: tl.constexpr,
-    PARALLEL: tl.constexpr,
+    middle,
     BLOCK: tl.constexpr,
 ):
-    cell = tl.program_id(0)
-    view = cell // columns
-    column = cell % columns
-    batch = tl.program_id(2)
+    """``sums``: running sums along z, ``(batch, ny, nx, knots)``; ``heights``: ``(views, 5)``, see
+    ``passes``; ``out``: ``(batch, views, rows, columns)``."""
+    number: tl.constexpr = out.dtype.element_ty
+    cell, batch = tl.program_id(0), tl.program_id(2).to(tl.int64)
+    view, column = cell // columns, cell % columns
     row = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
-    table = cells + cell * 8
-    p0, q0, p1, q1 = tl.load(table), tl.load(table + 1), tl.load(table + 2), tl.load(table + 3)
-    l0, l1, path, square = (
-        tl.load(table + 4),
-        tl.load(table + 5),
-        tl.load(table + 6),
-        tl.load(table + 7),
-    )
+    beside = (row - middle).to(number)
     axis = tl.load(axes + cell)
-    source_z, foot = tl.load(pose + view * 8 + 2), tl.load(pose + view * 8 + 7)
-    slabs = tl.where(axis == 0, ny, nx)
-    width = tl.where(axis == 0, nx, ny)
-    across = tl.where(axis == 0, nx, 1)
-    along = tl.where(axis == 0, 1, nx)
-    volume = lines + batch.to(tl.int64) * ny * nx * knots
-    layered = tl.abs(l1) < layered_below * layer
-    acc = tl.zeros((BLOCK,), dtype=out.dtype.element_ty)
-    r = slabs * 0  # while loops: the interpreter cannot take a tensor as the end of a range
-    while r < slabs:
-        ta, tb = p0 + q0 * r, p1 + q1 * r
-        lo = tl.maximum(tl.minimum(ta, tb), 0.0)
-        hi = tl.minimum(tl.maximum(ta, tb), width.to(tl.float64))
+    slabs, width = tl.where(axis == 0, ny, nx), tl.where(axis == 0, nx, ny)
+    across, along = tl.where(axis == 0, nx, 1), tl.where(axis == 0, 1, nx)
+    l0, l1 = tl.load(depths + cell * 4), tl.load(depths + cell * 4 + 1)
+    path, square = tl.load(depths + cell * 4 + 2), tl.load(depths + cell * 4 + 3)
+    ulp, nearest, layer = tl.load(numbers), tl.load(numbers + 1), tl.load(numbers + 2)
+    pitch, layered = tl.load(numbers + 4), tl.abs(l1) < tl.load(numbers + 3)
+    source, climb = tl.load(heights + view * 5), tl.load(heights + view * 5 + 1)
+    volume = sums + batch * ny * nx * knots
+    p0, q0, p1, q1 = _edges(lines, cell)
+    acc = tl.zeros((BLOCK,), dtype=number)
+    for r in tl.range(0, slabs):
+        k0, part, wide = _crossing(p0, q0, p1, q1, r, bits, ulp, number)
         depth = l0 + l1 * r
-        seen = hi > lo
-        if not PARALLEL:
-            seen = seen & (depth > nearest)
-        if seen:
-            scale = path / tl.abs(tb - ta)
-            k = lo.to(tl.int32)
-            stop = tl.minimum(tl.ceil(hi).to(tl.int32), width)
-            while k < stop:
-                w = scale * (tl.minimum(hi, k + 1.0) - tl.maximum(lo, k.to(tl.float64)))
-                base = volume + (r * across + k * along) * knots
-                if PLANE:
-                    acc += w.to(acc.dtype) * tl.load(base)
-                else:
-                    low = tl.floor(depth / layer)
-                    for m in tl.static_range(2):
-                        at = tl.where(layered, (low + m) * layer, depth)
-                        share = tl.where(
-                            layered,
-                            tl.where(m == 0, 1 - depth / layer + low, depth / layer - low),
-                            1 - m,
-                        )
-                        at = tl.where(share > 0, at, depth)
-                        step = at * row_pitch / dz
-                        zeta = (source_z + at * (row0 + foot - source_z) - z0) / dz + step * row
-                        change = _read(base, zeta + step, last) - _read(base, zeta, last)
-                        acc += (w * share / step).to(acc.dtype) * change
-                k += 1
-        r += 1
-    if not PLANE:
-        rise = row0 + (row + 0.5) * row_pitch + foot - source_z
-        acc = acc * tl.sqrt(1.0 + rise * rise / square).to(acc.dtype)
-    target = out + ((batch.to(tl.int64) * views + view) * rows + row) * columns + column
+        first = tl.maximum(k0, 0)
+        stop = tl.minimum(k0 + tl.ceil(part + wide).to(tl.int32), width)
+        stop = tl.where(depth > nearest, stop, first)
+        scale = path / wide
+        whole = tl.floor(depth / layer)
+        upper = depth / layer - whole
+        at = tl.where(layered, whole * layer, depth)
+        share = tl.where(layered, 1.0 - upper, 1.0)
+        step = at * pitch
+        zeta = source + at * climb + step * beside
+        for k in tl.range(first, stop):
+            d = (k - k0).to(number)
+            w = scale * (tl.minimum(part + wide, d + 1.0) - tl.maximum(part, d))
+            base = volume + (r * across + k * along).to(tl.int64) * knots
+            change = _read(base, zeta + step, last) - _read(base, zeta, last)
+            acc += (w * share / step) * change
+            if layered & (upper > 0):
+                far = at + layer
+                far_step = far * pitch
+                above = source + far * climb + far_step * beside
+                change = _read(base, above + far_step, last) - _read(base, above, last)
+                acc += (w * upper / far_step) * change
+    rise = tl.load(heights + view * 5 + 2) + tl.load(numbers + 5) * beside
+    acc = acc * tl.sqrt(1.0 + rise * rise / square)
+    target = out + ((batch * views + view) * rows + row) * columns + column
     tl.store(target, acc, mask=row < rows)
 
 
 @triton.jit
-def backproject_kernel(
+def _keys(table, r, k, PARALLEL: tl.constexpr):
+    """Of voxels k of slab r in a segment: the lower one of the keys of their two edges, how many
+    keys one is wide, and whether the slab lies before the source."""
+    slope, start, sign = tl.load(table), tl.load(table + 1), tl.load(table + 2)
+    if PARALLEL:
+        low, wide, front = k - slope * r, sign * sign, sign != 0
+    else:
+        away = r - slope  # slabs from the source's
+        front = away * sign > 0
+        away = tl.where(away == 0, 1.0, away)
+        low = tl.minimum((k - start) / away, (k + 1 - start) / away)
+        wide = 1.0 / tl.abs(away)
+    return low, wide, front
+
+
+@triton.jit
+def _first(of, table, buckets, low):
+    """The first column of a segment, in the order of its keys, that may touch what begins at a
+    key."""
+    step = (low - tl.load(table + 3)) * tl.load(table + 4)
+    step = tl.minimum(tl.maximum(step, 0.0), tl.load(of + 4) - 1)
+    return tl.load(buckets + tl.load(of + 3) + step.to(tl.int32))
+
+
+@triton.jit
+def _many(of, table, wide, front, cells):
+    """How many columns a voxel touches at most: its width, and a step of the table, in the
+    narrowest cells of the segment."""
+    many = tl.minimum(wide * tl.load(table + 5), cells).to(tl.int32) + tl.load(of + 5)
+    return tl.where(front, tl.minimum(many, cells), 0)
+
+
+@triton.jit
+def backproject_plane(
+    data,
+    out,
+    lines,
+    depths,
+    segments,
+    tables,
+    buckets,
+    numbers,
+    bits,
+    count,
+    slabs,
+    width,
+    begin,
+    views,
+    columns,
+    blocks,
+    PARALLEL: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Add a slice of views, ``begin`` and on, to ``out``, ``(batch, slabs, width)``.
+
+    ``data``: ``(batch, views, columns)``; ``segments, tables``: of the slice and of one main axis,
+    see ``passes``.
+    """
+    number: tl.constexpr = out.dtype.element_ty
+    r, batch = tl.program_id(0) // blocks, tl.program_id(1).to(tl.int64)
+    k = (tl.program_id(0) % blocks) * BLOCK + tl.arange(0, BLOCK)
+    ulp = tl.load(numbers)
+    target = out + (batch * slabs + r) * width + k
+    acc = tl.load(target, mask=k < width, other=0.0)
+    for s in tl.range(0, count):
+        of, table = segments + s * 6, tables + s * 6
+        view, first, cells = tl.load(of), tl.load(of + 1), tl.load(of + 2)
+        low, wide, front = _keys(table, r, k, PARALLEL)
+        backward = cells < 0
+        cells = tl.abs(cells)
+        j, many = _first(of, table, buckets, low), _many(of, table, wide, front, cells)
+        for m in tl.range(0, many):
+            c = tl.minimum(j + m, cells - 1)
+            column = first + tl.where(backward, cells - 1 - c, c)
+            cell = view * columns + column
+            p0, q0, p1, q1 = _edges(lines, cell)
+            k0, part, breadth = _crossing(p0, q0, p1, q1, r, bits, ulp, number)
+            near = (k0 - k).to(number) + part
+            w = tl.minimum(near + breadth, 1.0) - tl.maximum(near, 0.0)
+            good = (j + m < cells) & (k < width) & (w > 0)
+            path = tl.load(depths + cell * 4 + 2)
+            value = tl.load(
+                data + (batch * views + view - begin) * columns + column, mask=good, other=0.0
+            )
+            acc += tl.where(good, path / breadth * w, 0.0) * value
+    tl.store(target, acc, mask=k < width)
+
+
+@triton.jit
+def backproject_cone(
     sums,
     out,
-    cells,
-    pose,
+    lines,
+    depths,
     segments,
+    tables,
+    buckets,
+    heights,
+    numbers,
+    bits,
     count,
-    axis,
     slabs,
     width,
     nz,
@@ -128,92 +288,55 @@ def backproject_kernel(
     views,
     rows,
     columns,
-    z0,
-    dz,
-    row0,
-    row_pitch,
-    layer,
-    nearest,
-    layered_below,
-    PLANE: tl.constexpr,
-    PARALLEL: tl.constexpr,
-    STEPS: tl.constexpr,
-    ALONG: tl.constexpr,
+    middle,
     BLOCK: tl.constexpr,
 ):
     """Add a slice of views, ``begin`` and on, to ``out``, ``(batch, slabs, width, nz)``.
 
-    ``sums``: ``(batch, views, columns, rows + 1)`` (plane: readings); ``segments``: those of the
-    slice.
+    ``sums``: running sums along the rows, ``(batch, views, columns, rows + 1)``.
     """
-    blocks = tl.cdiv(width, ALONG)
-    r = tl.program_id(0) // blocks
-    k = (tl.program_id(0) % blocks) * ALONG + tl.arange(0, ALONG)[:, None]
-    z = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)[None, :]
+    number: tl.constexpr = out.dtype.element_ty
+    r, k = tl.program_id(0) // width, tl.program_id(0) % width
+    z = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     batch = tl.program_id(2).to(tl.int64)
+    beside = (z - middle).to(number)
+    ulp, nearest, layer = tl.load(numbers), tl.load(numbers + 1), tl.load(numbers + 2)
+    limit, pitch = tl.load(numbers + 3), tl.load(numbers + 6)
     target = out + ((batch * slabs + r) * width + k) * nz + z
-    inside = (k < width) & (z < nz)
-    acc = tl.load(target, mask=inside, other=0.0)
-    entries = tl.where(PLANE, 1, rows + 1)
-    s = slabs * 0
-    while s < count:
-        if tl.load(segments + s * 4 + 1) == axis:
-            view = tl.load(segments + s * 4)
-            start = tl.load(segments + s * 4 + 2)
-            cells_in = tl.load(segments + s * 4 + 3)
-            first = cells + (view * columns + start) * 8
-            end = first + (cells_in - 1) * 8
-            rising = (
-                tl.load(end + 2) + tl.load(end + 3) * r > tl.load(first) + tl.load(first + 1) * r
-            )
-            source_z, foot = tl.load(pose + view * 8 + 2), tl.load(pose + view * 8 + 7)
-            # First column whose far edge lies beyond the voxel's near edge.
-            low = tl.zeros((ALONG, 1), dtype=tl.int64)
-            high = tl.zeros((ALONG, 1), dtype=tl.int64) + cells_in
-            for _ in range(STEPS):
-                middle = tl.minimum((low + high) // 2, cells_in - 1)
-                far = tl.load(first + middle * 8 + 2) + tl.load(first + middle * 8 + 3) * r
-                beyond = tl.where(rising, far > k, far < k + 1)
-                open_ = low < high
-                high = tl.where(open_ & beyond, middle, high)
-                low = tl.where(open_ & (beyond == 0), middle + 1, low)
-            j = low
-            more = tl.max(tl.where((j < cells_in) & (k < width), 1, 0))
-            while more > 0:
-                here = first + tl.minimum(j, cells_in - 1) * 8
-                ta = tl.load(here) + tl.load(here + 1) * r
-                tb = tl.load(here + 2) + tl.load(here + 3) * r
-                depth = tl.load(here + 4) + tl.load(here + 5) * r
-                touch = (j < cells_in) & (k < width) & tl.where(rising, ta < k + 1, ta > k)
-                lo = tl.maximum(tl.minimum(ta, tb), k.to(tl.float64))
-                hi = tl.minimum(tl.maximum(ta, tb), k + 1.0)
-                good = touch & (hi > lo)
-                if not PARALLEL:
-                    good = good & (depth > nearest)
-                w = tl.where(good, tl.load(here + 6) * (hi - lo) / tl.abs(tb - ta), 0.0)
-                column = start + tl.minimum(j, cells_in - 1)
-                base = sums + ((batch * views + view - begin) * columns + column) * entries
-                if PLANE:
-                    acc += tl.where(good, w.to(acc.dtype) * tl.load(base), 0.0)
-                else:
-                    layered = tl.abs(tl.load(here + 5)) < layered_below * layer
-                    q = tl.floor(depth / layer)
-                    for m in tl.static_range(2):
-                        share = tl.where(
-                            layered,
-                            tl.where(m == 0, 1 - depth / layer + q, depth / layer - q),
-                            1 - m,
-                        )
-                        at = tl.where(
-                            good, tl.where(layered & (share > 0), (q + m) * layer, depth), 1.0
-                        )
-                        step = dz / (at * row_pitch)
-                        rho = (
-                            (z0 - source_z) / at - (row0 + foot - source_z)
-                        ) / row_pitch + step * z
-                        change = _read(base, rho + step, rows) - _read(base, rho, rows)
-                        acc += tl.where(good, (w * share).to(acc.dtype) * change, 0.0)
-                j += 1
-                more = tl.max(tl.where(touch & (j < cells_in), 1, 0))
-        s += 1
-    tl.store(target, acc, mask=inside)
+    acc = tl.load(target, mask=z < nz, other=0.0)
+    for s in tl.range(0, count):
+        of, table = segments + s * 6, tables + s * 6
+        view, first, cells = tl.load(of), tl.load(of + 1), tl.load(of + 2)
+        low, wide, front = _keys(table, r, k, False)
+        backward = cells < 0
+        cells = tl.abs(cells)
+        j, many = _first(of, table, buckets, low), _many(of, table, wide, front, cells)
+        many = tl.minimum(many, cells - j)
+        source, foot = tl.load(heights + view * 5 + 3), tl.load(heights + view * 5 + 4)
+        for m in tl.range(0, many):
+            c = j + m
+            column = first + tl.where(backward, cells - 1 - c, c)
+            cell = view * columns + column
+            p0, q0, p1, q1 = _edges(lines, cell)
+            k0, part, breadth = _crossing(p0, q0, p1, q1, r, bits, ulp, number)
+            near = (k0 - k).to(number) + part
+            w = tl.minimum(near + breadth, 1.0) - tl.maximum(near, 0.0)
+            l1 = tl.load(depths + cell * 4 + 1)
+            depth = tl.load(depths + cell * 4) + l1 * r
+            if (w > 0) & (depth > nearest):
+                w = w * tl.load(depths + cell * 4 + 2) / breadth
+                base = sums + ((batch * views + view - begin) * columns + column) * (rows + 1)
+                layered = tl.abs(l1) < limit
+                whole = tl.floor(depth / layer)
+                upper = depth / layer - whole
+                at = tl.where(layered, whole * layer, depth)
+                share = tl.where(layered, 1.0 - upper, 1.0)
+                step = pitch / at
+                rho = source / at - foot + step * beside
+                acc += (w * share) * (_read(base, rho + step, rows) - _read(base, rho, rows))
+                if layered & (upper > 0):
+                    far = at + layer
+                    step = pitch / far
+                    rho = source / far - foot + step * beside
+                    acc += (w * upper) * (_read(base, rho + step, rows) - _read(base, rho, rows))
+    tl.store(target, acc, mask=z < nz)
