@@ -35,6 +35,11 @@ NEAREST = 1e-6
 SLAB_BLOCK = 24
 """Slabs of one task of the adjoint: enough to reuse a layer, few enough to share the work. Fixed,
 for determinism."""
+BLOCK_BYTES = 512 << 10
+"""Of the running sums of a block of slabs in the forward pass: the second-level cache holds them
+while :data:`VIEWS` views read them. Fixed, for determinism."""
+VIEWS = 4
+"""Views that the forward pass takes through a block of slabs, one after the other."""
 INNER: Any = {
     "cache": True,
     "forceinline": True,
@@ -241,6 +246,21 @@ def _add_rows(lanes, line, at, depth, z0, dz, row0, row_pitch, out):
     )
 
 
+@_small
+def _give(at, centers, first, row0, row_pitch, sums, data):
+    """Sums over the slabs, ``(columns, ≥ rows)``, times the slant of each ray as readings ``(rows,
+    columns)``."""
+    rows, columns = data.shape
+    for j in range(columns):
+        a, b = centers[first + j, 0], centers[first + j, 1]
+        dx, dy = a * at[3] + b * at[5], a * at[4] + b * at[6]
+        square = dx * dx + dy * dy
+        for i in range(rows):
+            rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
+            slant = data.dtype.type(math.sqrt(1.0 + rise * rise / square))
+            data[i, j] = sums[j, i] * slant
+
+
 @_kernel
 def _project(
     begin,
@@ -267,86 +287,101 @@ def _project(
     columns)``."""
     knots = lines.shape[1]
     _, rows, columns = data.shape
-    # typed as in the adjoint: else what takes it is compiled for each
-    real, r0 = lines.dtype.type, np.int64(0)
+    most = max(ny, nx)
+    block = most
+    if lines.size * lines.itemsize > 2 * BLOCK_BYTES:
+        block = max(BLOCK_BYTES // (most * knots * lines.itemsize), 4)
     flat = lines.reshape(-1)
     pair, slab = np.empty((2, knots), dtype=lines.dtype), np.empty(knots, dtype=lines.dtype)
-    sums = np.empty((columns, (rows + 7) // 8 * 8), dtype=lines.dtype)  # padded(rows)
+    # padded(rows)
+    sums = np.empty((VIEWS, columns, (rows + 7) // 8 * 8), dtype=lines.dtype)
     for line in pair:
         _clear(line)
     layers, ends = np.empty(max(ny, nx), dtype=np.int64), np.empty(max(ny, nx), dtype=np.int64)
     offset = np.empty(0, dtype=np.int64)
     low, high = np.empty(0, dtype=lines.dtype), np.empty(0, dtype=lines.dtype)
-    for v in range(begin, end):
-        at = pose[v]
-        for line in sums:
-            _clear(line)
-        for s in range(start[v], start[v + 1]):
-            axis = segments[s, 1]
-            slabs, width = (ny, nx) if axis == 0 else (nx, ny)
-            across, along = (nx * knots, knots) if axis == 0 else (knots, nx * knots)
-            for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
-                p0, q0, p1, q1, l0, l1, path, square = _cell(
-                    at, edges, centers, first[v] + j, axis, lattice
-                )
-                layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
-                offset, low, high = _with_room(
-                    _room(p0, q0, p1, q1, r0, slabs, width), offset, low, high
-                )
-                runs = _plan(
-                    p0,
-                    q0,
-                    p1,
-                    q1,
-                    l0,
-                    l1,
-                    path,
-                    layer,
-                    layered,
-                    r0,
-                    slabs,
-                    width,
-                    across,
-                    along,
-                    layers,
-                    ends,
-                    offset,
-                    low,
-                    high,
-                )
-                e0 = 0
-                for n in range(runs):
-                    now, e1 = layers[n], ends[n]
-                    if not layered:
-                        sum_lines(lanes, flat, offset, low, e0, e1, knots, slab)
-                        _add_rows(lanes, slab, at, l0 + l1 * now, z0, dz, row0, row_pitch, sums[j])
-                        e0 = e1
+    for v0 in range(begin, end, VIEWS):
+        v1 = min(v0 + VIEWS, end)
+        sums[:] = 0
+        for r0 in range(0, most, block):
+            for v in range(v0, v1):
+                at, total = pose[v], sums[v - v0]
+                for s in range(start[v], start[v + 1]):
+                    axis = segments[s, 1]
+                    slabs, width = (ny, nx) if axis == 0 else (nx, ny)
+                    across, along = (nx * knots, knots) if axis == 0 else (knots, nx * knots)
+                    r1 = min(r0 + block, slabs)
+                    if r1 <= r0:
                         continue
-                    add_lines(
-                        lanes,
-                        flat,
-                        offset,
-                        low,
-                        high,
-                        e0,
-                        e1,
-                        knots,
-                        pair[now % 2],
-                        pair[(now + 1) % 2],
-                    )
-                    e0 = e1
-                    after = layers[n + 1] if n + 1 < runs else -9
-                    for m in range(now, now + 2):
-                        if m != after and m != after + 1:
-                            line = pair[m % 2]
-                            _add_rows(lanes, line, at, m * layer, z0, dz, row0, row_pitch, sums[j])
-                            _clear(line)
-                for i in range(rows):
-                    rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
-                    sums[j, i] *= real(math.sqrt(1.0 + rise * rise / square))
-        for i in range(rows):
-            for j in range(columns):
-                data[v, i, j] = sums[j, i]
+                    for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
+                        p0, q0, p1, q1, l0, l1, path, _ = _cell(
+                            at, edges, centers, first[v] + j, axis, lattice
+                        )
+                        layered = abs(l1) < MAX_LAYERS_PER_SLAB * layer
+                        offset, low, high = _with_room(
+                            _room(p0, q0, p1, q1, r0, r1, width), offset, low, high
+                        )
+                        runs = _plan(
+                            p0,
+                            q0,
+                            p1,
+                            q1,
+                            l0,
+                            l1,
+                            path,
+                            layer,
+                            layered,
+                            r0,
+                            r1,
+                            width,
+                            across,
+                            along,
+                            layers,
+                            ends,
+                            offset,
+                            low,
+                            high,
+                        )
+                        e0 = 0
+                        for n in range(runs):
+                            now, e1 = layers[n], ends[n]
+                            if not layered:
+                                sum_lines(lanes, flat, offset, low, e0, e1, knots, slab)
+                                depth = l0 + l1 * now
+                                _add_rows(lanes, slab, at, depth, z0, dz, row0, row_pitch, total[j])
+                                e0 = e1
+                                continue
+                            add_lines(
+                                lanes,
+                                flat,
+                                offset,
+                                low,
+                                high,
+                                e0,
+                                e1,
+                                knots,
+                                pair[now % 2],
+                                pair[(now + 1) % 2],
+                            )
+                            e0 = e1
+                            after = layers[n + 1] if n + 1 < runs else -9
+                            for m in range(now, now + 2):
+                                if m != after and m != after + 1:
+                                    line = pair[m % 2]
+                                    _add_rows(
+                                        lanes,
+                                        line,
+                                        at,
+                                        m * layer,
+                                        z0,
+                                        dz,
+                                        row0,
+                                        row_pitch,
+                                        total[j],
+                                    )
+                                    _clear(line)
+        for v in range(v0, v1):
+            _give(pose[v], centers, first[v], row0, row_pitch, sums[v - v0], data[v])
 
 
 def project(

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpcct.projector.cpu.cone_kernels import backproject, padded, project
+from torchpcct.projector.cpu.cone_kernels import VIEWS, backproject, padded, project
 from torchpcct.projector.tables import Tables
 from torchpcct.threads import get_num_threads
 
@@ -79,7 +79,8 @@ class ConePasses:
             8 * (8 * self.tables.rays.views + 4 * len(self.tables.segments.table)),
         )
         nz, ny, nx = self.tables.grid.shape
-        forward = ny * nx * (nz + 16) + r.columns * padded(r.rows) * get_num_threads()
+        sums = VIEWS * r.columns * padded(r.rows) * get_num_threads()
+        forward = ny * nx * (nz + 16) + sums
         return (
             table + itemsize * forward,
             table + itemsize * 2 * ny * nx * (nz + 8),
