@@ -5,7 +5,8 @@ backprojection), :mod:`recon.least_squares` (PWLS; its engine is :mod:`recon.gra
 :mod:`recon.mbir` (unrolled steps with a learned prior). All that PWLS and MBIR see of a scan is
 its :mod:`~recon.data_term`; each method gives :mod:`~recon.result`. Tools:
 :mod:`~recon.conjugate_gradient`, :mod:`~recon.filters` of a volume.
-What a method has to beat: :mod:`recon.evaluate`. Comparisons: :mod:`recon.study`.
+A geometry from the object itself: :mod:`recon.calibration`. What a method has to beat:
+:mod:`recon.evaluate`. Comparisons: :mod:`recon.study`.
 """
 
 import importlib
@@ -16,12 +17,14 @@ import torchpcct  # noqa: F401  (first: it settles how torch's threads wait)
 if TYPE_CHECKING:
     from recon.analytic.fbp import fbp
     from recon.api import reconstruct
+    from recon.calibration import calibrate
     from recon.least_squares.pwls import pwls
     from recon.names import METHODS
 
-__all__ = ["METHODS", "fbp", "pwls", "reconstruct"]
+__all__ = ["METHODS", "calibrate", "fbp", "pwls", "reconstruct"]
 
 _SOURCES = {
+    "calibrate": "recon.calibration",
     "fbp": "recon.analytic.fbp",
     "pwls": "recon.least_squares.pwls",
     "METHODS": "recon.names",

@@ -41,7 +41,13 @@ from recon.cli.parsing import (
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.plaque import add_plaque
-from recon.cli.scans import add_lower_dose, add_reconstruct, add_show_config, add_simulate
+from recon.cli.scans import (
+    add_calibrate,
+    add_lower_dose,
+    add_reconstruct,
+    add_show_config,
+    add_simulate,
+)
 from recon.cli.starting import add_demo, add_doctor, add_train, demo_steps, train
 from torchpcct import __version__
 from torchpcct.files import WriteError, speak_any_encoding
@@ -52,6 +58,7 @@ _GROUPS = {
         add_simulate,
         add_show_config,
         add_reconstruct,
+        add_calibrate,
         add_lower_dose,
         add_train,
     ),

@@ -122,6 +122,7 @@ def test_help_and_refusals_load_neither_torch_nor_numba(tmp_path):
 
 _FIRST = {
     "reconstruct": ["s"],
+    "calibrate": ["s"],
     "lower-dose": ["s"],
     "view": ["v"],
     "info": ["f"],

@@ -263,7 +263,7 @@ def _centre_text(size: float, error: float) -> str:
     return (
         f"conjugate rays disagree: the geometry puts the columns about {abs(size):.2f} ± "
         f"{error:.2g} columns too {'high' if size > 0 else 'low'}: the rotation centre (the "
-        "detector's column offset) is wrong, or the object moved"
+        "detector's column offset) is wrong, or the object moved. torchpcct calibrate finds it"
     )
 
 
@@ -291,7 +291,7 @@ def _roll_text(size: float, error: float) -> str:
     return (
         "conjugate rays disagree, in higher rows the other way than in lower ones: the detector is "
         f"rolled by about {math.degrees(abs(size)):.2g} ± {math.degrees(error):.1g}° against the "
-        "rotation axis"
+        "rotation axis. torchpcct calibrate finds it"
     )
 
 

@@ -71,8 +71,10 @@ class ParametricGeometry:
         for name, value in given.items():
             if not torch.isfinite(value).all():
                 raise ValueError(f"{name} has values that are not finite")
-        make = _of_vectors if isinstance(self.base, VectorGeometry) else _of_circle
-        source, centre, u, v = make(self.base, given)
+        if isinstance(self.base, VectorGeometry):
+            source, centre, u, v = _of_vectors(self.base, given)
+        else:
+            source, centre, u, v = _of_circle(self.base, given)
         for name in _TURNS:
             if name in given:
                 about = {"slant": v, "tilt": u, "roll": torch.linalg.cross(u, v)}[name]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.geometry import Geometry, VolumeGrid
+from torchpcct.geometry import Geometry, VolumeGrid, beam
 from torchpcct.projector.rays import (
     Segments,
     check_pair,
@@ -58,7 +58,7 @@ class Tables:
                 c, s = np.cos(turn), np.sin(turn)
                 y, x = shift[:, -2].copy(), shift[:, -1].copy()
                 shift[:, -2], shift[:, -1] = c * y - s * x, c * x + s * y
-                seen = replace(geometry, angles=geometry.angles - turn)
+                seen = replace(beam(geometry), angles=geometry.angles - turn)
                 self.rays = rays_of(seen, window)
             self.rays = self.rays.moved(shift)
         if not self.rays.parallel:
