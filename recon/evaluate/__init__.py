@@ -3,11 +3,12 @@ image?
 
 :func:`evaluate` runs tasks (:mod:`~recon.evaluate.task`, ready ones in
 :mod:`~recon.evaluate.tasks`) × methods (:mod:`~recon.evaluate.methods`) on the same noise
-realisations (:mod:`~recon.evaluate.draws`), reads the volumes (:mod:`~recon.evaluate.measure`) and
-gives figures with intervals (:mod:`~recon.evaluate.estimates`), of which :func:`save` makes a
-report. What every method has to beat is in :mod:`~recon.evaluate.rivals`: the strongest simple
-filters of a volume. Where nobody knows the truth: :func:`evaluate_scans`, and
-:func:`contrast_recovery`, what a method would show of a lesion in a given scan.
+realisations (:mod:`~recon.evaluate.realisations`), reads the volumes
+(:mod:`~recon.evaluate.measure`) and gives figures with intervals
+(:mod:`~recon.evaluate.estimates`), of which :func:`save` makes a report. What every method has to
+beat is in :mod:`~recon.evaluate.rivals`: the strongest simple filters of a volume. Where nobody
+knows the truth: :func:`evaluate_scans`, and :func:`contrast_recovery`, what a method would show of
+a lesion in a given scan.
 
 Your denoiser on a lung nodule:
 

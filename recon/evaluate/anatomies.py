@@ -3,9 +3,9 @@ with exact truths.
 
 A reconstruction that knows what vessels look like may close an ulcer, flatten a thrombus or draw a
 wall that is not there. Each :class:`Anatomy` is a pair of scenes about the middle of an inset, with
-a feature and without it. On the same noise draw the difference of two volumes is what a method
-shows of the feature, and what it shows beside. :class:`recon.evaluate.tasks.AnatomyTask` measures
-it.
+a feature and without it. On the same noise realisation the difference of two volumes is what a
+method shows of the feature, and what it shows beside. :class:`recon.evaluate.tasks.AnatomyTask`
+measures it.
 
 Scenes are made of parts, laid over each other in order. Shapes and CT numbers are our own choice of
 what coronary arteries look like on CT: lumens of 2 to 3 mm with 460 HU, walls of 0.2 mm, fat of -90

@@ -23,7 +23,7 @@ from functools import cached_property
 
 import numpy as np
 
-from recon.evaluate.draws import Draws, Simulated
+from recon.evaluate.realisations import Realisations, Simulated
 from recon.evaluate.task import GroundTruth, Task
 from recon.jobs.sources import source_digest
 from recon.jobs.store import Store
@@ -101,7 +101,7 @@ def mean_paths(
     return paths
 
 
-class EnergyDraws(Draws):
+class EnergyRealisations(Realisations):
     """All realisations of one task, their energy bins summed with weights.
 
     Args:
@@ -114,7 +114,7 @@ class EnergyDraws(Draws):
             that do not exist or do not differ.
     """
 
-    def __init__(self, base: Draws, energies: str, kernels: Sequence[str]) -> None:
+    def __init__(self, base: Realisations, energies: str, kernels: Sequence[str]) -> None:
         task = base.task
         super().__init__(task, base.store, base.seed, kernels or base.kernels[:1])
         if not task.has_energies:
@@ -133,7 +133,7 @@ class EnergyDraws(Draws):
 
     @property
     def key(self) -> str:
-        """See :attr:`Draws.key`."""
+        """See :attr:`Realisations.key`."""
         return f"{super().key} {source_digest(__name__)}"
 
     @cached_property
@@ -144,16 +144,16 @@ class EnergyDraws(Draws):
 
     @cached_property
     def clean(self) -> tuple[Scan, Scan]:
-        """See :attr:`Draws.clean`."""
+        """See :attr:`Realisations.clean`."""
         present, absent = (scan.weighted(self.weights) for scan in self.bins)
         return present, absent
 
     def _ground_truth(self) -> GroundTruth:
         return self.task.ground_truth_of(*self.clean)
 
-    def draw(self, exposure_s: float, k: int) -> tuple[Simulated, Simulated]:
-        """See :meth:`Draws.draw`: the same photons, each in its bin."""
-        summed = self.base.draw(exposure_s, k)[0].scan
+    def pair(self, exposure_s: float, k: int) -> tuple[Simulated, Simulated]:
+        """See :meth:`Realisations.pair`: the same photons, each in its bin."""
+        summed = self.base.pair(exposure_s, k)[0].scan
         clean, bins = self.clean[0], self.bins[0]
         counts = split(summed.counts, bins.counts, summed._first_index(), int(summed.seed or 0))
         readings = weighted_sum(bins, counts, np.asarray(self.weights))

@@ -4,11 +4,11 @@ One rule makes every dose factor: of two methods the one whose figure is larger 
 needs more dose for, and every figure here (noise variance, variance of a contrast at slope 1, CNR²,
 d′²) is proportional to the dose for a linear method. So the factor is the ratio of the method's
 figure to the linear reference's at the same dose. Both are of the same noise realisations, so what
-is luck of the draws cancels in the ratio; intervals are jackknife intervals over realisations
-(:mod:`torchpcct.metrics.intervals`). What is drawn is controlled (:mod:`torchpcct.metrics.control`)
-by linear functionals of the same noise, whose moments are exactly known: of MBIR by its own
-response (:mod:`recon.evaluate.response`), of other methods by the reference's ROI means. Of FBP all
-but noise and d′ is exact.
+is luck of the realisations cancels in the ratio; intervals are jackknife intervals over
+realisations (:mod:`torchpcct.metrics.intervals`). What is drawn is controlled
+(:mod:`torchpcct.metrics.control`) by linear functionals of the same noise, whose moments are
+exactly known: of MBIR by its own response (:mod:`recon.evaluate.response`), of other methods by the
+reference's ROI means. Of FBP all but noise and d′ is exact.
 
 * slope: contrast that the signal adds over the true one; a method may buy low noise with it, so
   contrasts are compared at slope 1: variance over slope², in units of the true contrast, which of
@@ -68,12 +68,12 @@ class ReferenceNoise:
     Attributes:
         covariance: ``(rois, 2, rois, 2)`` of the ROI means at the exposure, HU².
         mean: ``(2, rois, 2)`` of noise-free data, with and without the signal.
-        draws: ``(n, 2, rois, 2)`` of the same realisations as those of the methods.
+        realisations: ``(n, 2, rois, 2)`` of the same realisations as those of the methods.
     """
 
     covariance: Floats
     mean: Floats
-    draws: Floats
+    realisations: Floats
 
 
 class _Figures:
@@ -83,7 +83,7 @@ class _Figures:
         readings: of its volumes.
         true: ``(rois,)`` contrasts that the signal adds, HU: background less signal.
         absent: ``(rois,)`` true contrasts without the signal, HU.
-        reference: on the same draws; what is drawn is controlled by it.
+        reference: on the same realisations; what is drawn is controlled by it.
         exact: the method's own covariance of ROI means as
             :attr:`ReferenceNoise.covariance`; None: it is drawn.
     """
@@ -117,7 +117,7 @@ class _Figures:
             return float((weights * self.r.clean_rois[without_signal]).sum())
         values, control = (
             np.einsum("nrs,rs->n", v[:, without_signal], weights)
-            for v in (self.r.rois, self.reference.draws)
+            for v in (self.r.rois, self.reference.realisations)
         )
         return controlled_mean(
             values, control, float((weights * self.reference.mean[without_signal]).sum())
@@ -128,7 +128,8 @@ class _Figures:
         if self.exact is not None:
             return math.log(float(np.einsum("rs,rstu,tu->", weights, self.exact, weights)))
         values, control = (
-            np.einsum("nrs,rs->n", v[:, 0], weights) for v in (self.r.rois, self.reference.draws)
+            np.einsum("nrs,rs->n", v[:, 0], weights)
+            for v in (self.r.rois, self.reference.realisations)
         )
         known = float(np.einsum("rs,rstu,tu->", weights, self.reference.covariance, weights))
         return controlled_log_variance(values, control, known)

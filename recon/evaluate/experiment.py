@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.evaluate.draws import Draws
-from recon.evaluate.energies import BINS, EnergyDraws, with_bins
+from recon.evaluate.energies import BINS, EnergyRealisations, with_bins
 from recon.evaluate.estimates import Record, ReferenceNoise, records_of
 from recon.evaluate.measure import BLOCK, Measurement, Reader, Readings, kept_as
-from recon.evaluate.methods import Method, MethodLike, method_of
+from recon.evaluate.methods import Method, MethodLike, listed, method_of
+from recon.evaluate.realisations import Realisations
 from recon.evaluate.task import GroundTruth, Task
 from recon.evaluate.tasks import TaskLike, read_task
 from recon.jobs import execute
@@ -115,8 +115,8 @@ def evaluate(
             kept.
     """
     n, seed = whole("n", n, LEAST), whole("seed", seed, 0)
-    todo = [read_task(t) for t in _listed(tasks)]
-    run = [method_of(m) for m in _listed(methods)]
+    todo = [read_task(t) for t in listed(tasks)]
+    run = [method_of(m) for m in listed(methods)]
     for kind, names in (("tasks", [t.name for t in todo]), ("methods", [m.name for m in run])):
         twice = {name for name in names if names.count(name) > 1}
         if twice:
@@ -133,7 +133,7 @@ def evaluate(
     exposures = (
         None
         if exposures_s is None
-        else tuple(numbers("exposures_s", _listed(exposures_s), positive=True, unit="s"))
+        else tuple(numbers("exposures_s", listed(exposures_s), positive=True, unit="s"))
     )
     if folder is None:
         with TemporaryDirectory() as kept:
@@ -174,10 +174,6 @@ def evaluate(
         "exposures_s": exposures,
     }
     return Evaluation(records, seen, settings)
-
-
-def _listed(what: Any) -> Sequence[Any]:
-    return list(what) if isinstance(what, list | tuple | np.ndarray) else [what]
 
 
 def _everyone(task: Task, methods: Sequence[Method]) -> list[Method]:
@@ -224,7 +220,9 @@ def _sent(
                 error,
             )
     bench = _Bench(folder, task, everyone, seed)
-    packed = zlib.compress(execute.packed_call(executor, (task, sent, seed, bench.draws.kernels)))
+    packed = zlib.compress(
+        execute.packed_call(executor, (task, sent, seed, bench.realisations.kernels))
+    )
     return _jobs(bench, sent, packed, exposures, n, workers=getattr(executor, "workers", 16))
 
 
@@ -250,7 +248,7 @@ def _jobs(
         n: realisations.
         workers: that take jobs at once.
     """
-    task, seed, store = bench.draws.task, bench.draws.seed, bench.draws.store
+    task, seed, store = bench.realisations.task, bench.realisations.seed, bench.realisations.store
     place, first = f"{task.name}/", f"{task.name}: ground truth"
     jobs, scans = [], {f"{task.name}: scan, signal {s}": s for s in ("present", "absent")}
     in_bins = {f"{task.name}: scan in energy bins, signal {s}": s for s in ("present", "absent")}
@@ -356,8 +354,8 @@ def _kernels(methods: Sequence[Method], energies: str | None, exact: bool = True
 
 
 class _Bench:
-    """A task with the methods that are measured at it: its draws, what reads their volumes, and
-    what its jobs do."""
+    """A task with the methods that are measured at it: its realisations, what reads their volumes,
+    and what its jobs do."""
 
     def __init__(
         self,
@@ -369,40 +367,42 @@ class _Bench:
     ) -> None:
         if kernels is None:
             kernels = _kernels(methods, None, exact=False)
-        self.draws = Draws(task, Store(folder / task.name), seed, kernels)
+        self.realisations = Realisations(task, Store(folder / task.name), seed, kernels)
         self.methods = {m.name: m for m in methods}
-        self._weighted = dict[str, Draws]()
+        self._weighted = dict[str, Realisations]()
         self._readers = dict[str | None, Reader]()
 
-    def draws_of(self, energies: str | None) -> Draws:
+    def realisations_of(self, energies: str | None) -> Realisations:
         """The realisations that methods with an option ``energies`` are given."""
         if energies is None:
-            return self.draws
+            return self.realisations
         if energies not in self._weighted:
             kernels = _kernels(list(self.methods.values()), energies, exact=False)
-            self._weighted[energies] = EnergyDraws(self.draws, energies, kernels)
+            self._weighted[energies] = EnergyRealisations(self.realisations, energies, kernels)
         return self._weighted[energies]
 
     def reader_of(self, energies: str | None) -> Reader:
         """Of their volumes; it needs the ground truth."""
         if energies not in self._readers:
-            draws = self.draws_of(energies)
-            self._readers[energies] = Reader(draws.task, draws.task.truth(draws.ground_truth))
+            realisations = self.realisations_of(energies)
+            self._readers[energies] = Reader(
+                realisations.task, realisations.task.truth(realisations.ground_truth)
+            )
         return self._readers[energies]
 
     def scan(self, signal: str) -> None:
-        self.draws.task.prepare(self.draws.store, signal)
+        self.realisations.task.prepare(self.realisations.store, signal)
 
     def bins(self, signal: str) -> None:
-        task = self.draws.task
+        task = self.realisations.task
         in_bins = replace(task, scanner=with_bins(task.scanner))
-        in_bins.scan(Store(self.draws.store.folder / BINS), signal)
+        in_bins.scan(Store(self.realisations.store.folder / BINS), signal)
 
     def ground_truth(self) -> None:
-        _ = self.draws.ground_truth
+        _ = self.realisations.ground_truth
 
     def exact(self, kernels: Sequence[str]) -> None:
-        self.draws.exact_covariances(kernels)
+        self.realisations.exact_covariances(kernels)
 
     def block(self, exposure: float, names: Sequence[str], k: range) -> None:
         """Pieces of methods at an exposure: of a block of realisations, or of none what is
@@ -423,17 +423,20 @@ class _Bench:
     def measurement(self, name: str, exposure: float) -> Measurement:
         """Of a method at an exposure."""
         method = self.methods[name]
-        draws, reader = self.draws_of(method.energies), self.reader_of(method.energies)
-        return Measurement(method, draws, reader, exposure)
+        realisations, reader = (
+            self.realisations_of(method.energies),
+            self.reader_of(method.energies),
+        )
+        return Measurement(method, realisations, reader, exposure)
 
     def _pairs(self, exposure: float, k: range) -> Callable[[str | None], list[Any]]:
         """Realisations for an option ``energies``, drawn once for all methods, if one needs
         them."""
-        return cache(lambda energies: [self.draws_of(energies).draw(exposure, i) for i in k])
+        return cache(lambda energies: [self.realisations_of(energies).pair(exposure, i) for i in k])
 
     def contrasts(self, energies: str | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """True contrasts of the ROIs: what the signal adds, and what there is without it, HU."""
-        truth, regions = self.reader_of(energies).truth, self.draws.task.regions
+        truth, regions = self.reader_of(energies).truth, self.realisations.task.regions
         added, absent = (
             np.array([float((hu.double() * (b - a)).sum()) for a, b in regions.values()])
             for hu in (truth[0] - truth[1], truth[1])
@@ -456,11 +459,15 @@ def _run_job(folder: Path, given: _Bench | bytes, job: str, *args: Any) -> None:
 
 def _read(bench: _Bench, exposures: Sequence[float], n: int) -> tuple[list[Record], TaskResult]:
     """The figures of a task, from the pieces of its jobs."""
-    reader, task, everyone = bench.reader_of(None), bench.draws.task, list(bench.methods.values())
+    reader, task, everyone = (
+        bench.reader_of(None),
+        bench.realisations.task,
+        list(bench.methods.values()),
+    )
     reference = everyone[0]
     kinds = list(dict.fromkeys(m.energies for m in everyone))
     contrasts = {e: bench.contrasts(e) for e in kinds}
-    at_1_s = {e: bench.draws_of(e).exact_covariances(_kernels(everyone, e)) for e in kinds}
+    at_1_s = {e: bench.realisations_of(e).exact_covariances(_kernels(everyone, e)) for e in kinds}
     records: list[Record] = []
     volumes = {}
     for exposure in exposures:
@@ -480,7 +487,7 @@ def _read(bench: _Bench, exposures: Sequence[float], n: int) -> tuple[list[Recor
                 own,
                 base,
                 control,
-                bench.draws_of(e).ground_truth,
+                bench.realisations_of(e).ground_truth,
                 *contrasts[e],
                 reader.rois,
                 exact,
@@ -488,7 +495,7 @@ def _read(bench: _Bench, exposures: Sequence[float], n: int) -> tuple[list[Recor
             )
     true_hu = dict(zip(reader.rois, contrasts[reference.energies][0].tolist(), strict=True))
     truth = reader.truth[0].numpy()
-    return records, TaskResult(task, bench.draws.ground_truth, true_hu, truth, volumes)
+    return records, TaskResult(task, bench.realisations.ground_truth, true_hu, truth, volumes)
 
 
 def measured_before(
@@ -517,7 +524,7 @@ def measured_before(
         given, before = (
             (
                 sorted(names),
-                None if exposures is None else [float(e) for e in _listed(exposures)],
+                None if exposures is None else [float(e) for e in listed(exposures)],
                 runs,
                 first,
             )
@@ -563,7 +570,7 @@ def _finished(
         return True
     store = Store(folder / task.name)
     blocks = [range(0), *_blocks(n)]
-    for exposure in task.exposures_s if exposures_s is None else _listed(exposures_s):
+    for exposure in task.exposures_s if exposures_s is None else listed(exposures_s):
         place, key = kept_as(method, float(exposure), task, seed)
         if not all(store.has(f"{place}/{part}", key) for k in blocks for part in _parts(method, k)):
             return False
@@ -599,19 +606,19 @@ def export_scans(
     exposures = (
         None
         if exposures_s is None
-        else numbers("exposures_s", _listed(exposures_s), positive=True, unit="s")
+        else numbers("exposures_s", listed(exposures_s), positive=True, unit="s")
     )
     written = []
-    for task in map(read_task, _listed(tasks)):
+    for task in map(read_task, listed(tasks)):
         with TemporaryDirectory() as kept:
-            draws = Draws(task, Store(Path(kept)), seed)
+            realisations = Realisations(task, Store(Path(kept)), seed)
             for exposure in exposures or task.exposures_s:
-                pairs = [[draws.noise_free(p, exposure) for p in (True, False)]]
+                pairs = [[realisations.noise_free(p, exposure) for p in (True, False)]]
                 for k in range(-1, n):
-                    for draw in pairs[0] if k < 0 else draws.draw(exposure, k):
-                        path = Path(folder) / f"{draw.label}.h5"
+                    for realisation in pairs[0] if k < 0 else realisations.pair(exposure, k):
+                        path = Path(folder) / f"{realisation.label}.h5"
                         path.parent.mkdir(parents=True, exist_ok=True)
-                        draw.scan.save(path)
+                        realisation.scan.save(path)
                         written.append(path)
                     if progress is not None:
                         progress(f"{task.name}: {exposure:g} s", (k + 2) / (n + 1))

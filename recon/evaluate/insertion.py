@@ -31,8 +31,8 @@ from torch import Tensor
 
 from recon.api import reconstruct
 from recon.evaluate.measure import volume_of
-from recon.evaluate.methods import Method, MethodLike, method_of, noise_of
-from recon.evaluate.without_truth import MeasuredDraw, as_slices
+from recon.evaluate.methods import Method, MethodLike, listed, method_of, noise_of
+from recon.evaluate.without_truth import MeasuredRealisation, as_slices
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.recovery import recovered_contrast
 from torchpcct.projector import Projector
@@ -241,7 +241,7 @@ def contrast_recovery(
     """
     if not balls or not all(isinstance(b, InsertedBall) for b in balls):
         raise TypeError(f"balls must be a sequence of InsertedBall, got {balls!r}")
-    asked = [method_of(m) for m in (methods if isinstance(methods, list | tuple) else [methods])]
+    asked = [method_of(m) for m in listed(methods)]
     if not asked:
         raise ValueError("methods must name at least one method")
     for method in asked:
@@ -266,7 +266,7 @@ def contrast_recovery(
         nonlocal done
         found = {}
         for name, method in steps.items():
-            found[name] = volume_of(method, _Draw(of, grid, noise))
+            found[name] = volume_of(method, _InsertedRealisation(of, grid, noise))
             done += 1
             tell(done / total)
         return found
@@ -297,7 +297,7 @@ def contrast_recovery(
 
 
 @dataclass(frozen=True, eq=False)
-class _Draw(MeasuredDraw):
+class _InsertedRealisation(MeasuredRealisation):
     """The scan as methods ask for it, FBP as :func:`recon.reconstruct` gives it."""
 
     def fbp(self, kernel: str) -> Tensor:
@@ -313,7 +313,8 @@ def _noise(scan: Scan, grid: VolumeGrid) -> Callable[[Method, float], float]:
     def noise(method: Method, smooths: float) -> float:
         if method.name not in kept:
             first, second = (
-                method.run(_Draw(scan.select(slice(k, None, 2)), grid)) for k in (0, 1)
+                method.run(_InsertedRealisation(scan.select(slice(k, None, 2)), grid))
+                for k in (0, 1)
             )
             kept[method.name] = 0.5 * (first - second)
         return noise_of(kept[method.name], torch.arange(grid.voxels), smooths)

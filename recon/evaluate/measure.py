@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
-from recon.evaluate.draws import Draws
 from recon.evaluate.methods import Method, Realisation
+from recon.evaluate.realisations import Realisations
 from recon.evaluate.task import BESIDE_MM, Task
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.observer import dog_channels, template_channel
@@ -69,9 +69,9 @@ class Readings:
         flat: tissue → ``(n, voxels)`` HU, with the signal.
         clean_rois: ``(2, rois, 2)`` of noise-free data; clean_square: likewise; clean_rim: least
             error there in the rim of the largest tissue, HU.
-        control: ``(n, 2, rois, 2)`` HU: linear functionals of the same draws that follow ``rois``,
-            with their mean ``(2, rois, 2)`` and covariance ``(rois, 2, rois, 2)``; None: the
-            reference's ROI means serve.
+        control: ``(n, 2, rois, 2)`` HU: linear functionals of the same realisations that follow
+            ``rois``, with their mean ``(2, rois, 2)`` and covariance ``(rois, 2, rois, 2)``; None:
+            the reference's ROI means serve.
         first: first volume with the signal, float16, and that of noise-free data.
         seconds: of a volume.
         drawn, warned: shares of volumes with and without the signal in which MBIR drew a vessel, or
@@ -202,17 +202,19 @@ class Reader:
         return {t: volume.reshape(-1)[at].float().numpy() for t, at in self.task.flat.items()}
 
 
-def volume_of(method: Method, draw: Realisation) -> Tensor:
+def volume_of(method: Method, realisation: Realisation) -> Tensor:
     """A method's volume, checked: HU ``(z, y, x)`` float32.
 
     Raises:
         TypeError, ValueError: what it gave is no volume on the task's grid in HU: another type,
             shape or grid, NaN.
     """
-    given = method.run(draw)
+    given = method.run(realisation)
     if isinstance(given, Volume):
-        if given.grid != draw.grid:
-            raise ValueError(f"{method.name} gave a volume on {given.grid}, asked was {draw.grid}")
+        if given.grid != realisation.grid:
+            raise ValueError(
+                f"{method.name} gave a volume on {given.grid}, asked was {realisation.grid}"
+            )
         if given.unit != "HU":
             raise ValueError(f"{method.name} gave a volume in {given.unit}: HU are needed")
         given = given.data
@@ -223,10 +225,10 @@ def volume_of(method: Method, draw: Realisation) -> Tensor:
         raise TypeError(
             f"{method.name} gave {kind}: a real tensor, array or Volume (z, y, x) in HU is needed"
         )
-    if tuple(given.shape) != draw.grid.shape:
+    if tuple(given.shape) != realisation.grid.shape:
         raise ValueError(
             f"{method.name} gave a volume of shape {tuple(given.shape)}, the inset has "
-            f"{draw.grid.shape}"
+            f"{realisation.grid.shape}"
         )
     bad = int((~torch.isfinite(given)).sum())
     if bad:
@@ -276,26 +278,28 @@ class Measurement:
 
     Args:
         method: what reconstructs.
-        draws: of the task; reader: of its volumes.
+        realisations: of the task; reader: of its volumes.
         exposure_s: in s.
     """
 
-    def __init__(self, method: Method, draws: Draws, reader: Reader, exposure_s: float) -> None:
-        self.method, self.reader, self.store = method, reader, draws.store
-        self._place, self._key = kept_as(method, exposure_s, draws.task, draws.seed)
+    def __init__(
+        self, method: Method, realisations: Realisations, reader: Reader, exposure_s: float
+    ) -> None:
+        self.method, self.reader, self.store = method, reader, realisations.store
+        self._place, self._key = kept_as(method, exposure_s, realisations.task, realisations.seed)
         self._pieces: list[dict[str, Any]] = []
 
         def clean() -> dict[str, Any]:
-            pair = [draws.noise_free(p, exposure_s) for p in (True, False)]
+            pair = [realisations.noise_free(p, exposure_s) for p in (True, False)]
             return _measure_pairs(
-                [pair], method, reader, keep=True, fbp=pair[0].fbp(draws.kernels[0])
+                [pair], method, reader, keep=True, fbp=pair[0].fbp(realisations.kernels[0])
             )
 
         self._clean = self.store.piece(f"{self._place}/clean", self._key, clean)
         self._known: dict[str, Any] | None = None
         self._adjoints: Tensor | None = None
         if method.network is not None:
-            respond = partial(draws.response, method.network, reader, exposure_s)
+            respond = partial(realisations.response, method.network, reader, exposure_s)
             self._known = self.store.piece(f"{self._place}/response", self._key, respond)
             self._adjoints = torch.from_numpy(self._known["adjoints"])
 
@@ -350,8 +354,8 @@ def _measure_pairs(
     adjoints: Tensor | None = None,
     fbp: Tensor | None = None,
 ) -> dict[str, Any]:
-    """A piece of pairs; with ``fbp``, which then is that of the first draw, the first volume is
-    checked against it."""
+    """A piece of pairs; with ``fbp``, which then is that of the first realisation, the first volume
+    is checked against it."""
     lists: dict[str, list[Any]] = {
         name: []
         for name in (
@@ -371,18 +375,18 @@ def _measure_pairs(
     first = None
     for pair in pairs:
         volumes = []
-        for draw in pair:
+        for realisation in pair:
             began = time.perf_counter()
-            volumes.append(volume_of(method, draw))
+            volumes.append(volume_of(method, realisation))
             seconds.append(time.perf_counter() - began)
             if fbp is not None and len(seconds) == 1:
                 check_volume(volumes[0], method, reader, fbp)
         lists["rois"].append([reader.pair(v) for v in volumes])
         for name in ("drawn", "warned"):
-            said = [getattr(draw, name, None) for draw in pair]
+            said = [getattr(realisation, name, None) for realisation in pair]
             lists[name].append([math.nan if answer is None else float(answer) for answer in said])
         if adjoints is not None:
-            control.append([functionals(adjoints, draw.term.b[0]) for draw in pair])
+            control.append([functionals(adjoints, realisation.term.b[0]) for realisation in pair])
         for o in OBSERVERS:
             channels[o].append([reader.responses(v, o) for v in volumes])
         lists["square"].append(reader.square(volumes[0], reader.task.near))

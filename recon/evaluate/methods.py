@@ -30,11 +30,12 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -55,7 +56,8 @@ __all__ = ["Method", "Realisation", "denoiser", "method_of"]
 
 
 class Realisation(Protocol):
-    """One realisation, as a method sees it: simulated (:mod:`recon.evaluate.draws`) or measured."""
+    """One realisation, as a method sees it: simulated (:mod:`recon.evaluate.realisations`) or
+    measured."""
 
     @property
     def scan(self) -> Scan:
@@ -103,7 +105,7 @@ class Method:
         run: from a :class:`Realisation` to HU ``(z, y, x)``.
         key: what its results depend on beside its name (weights, source), so that kept ones are not
             mixed up.
-        kernels: of FBP that it asks a draw for.
+        kernels: of FBP that it asks a realisation for.
         is_fbp: its volume is FBP with the first of them: means and variances of its ROIs are exact.
         network: it is this MBIR, whose own response to noise controls what is drawn.
         energies: the contrast for which it is given weighted energy bins
@@ -129,6 +131,11 @@ class Method:
 MethodLike: TypeAlias = str | Method | Callable[[Scan, VolumeGrid], Tensor | Volume]
 """What a method is given by: its name (``"fbp:soft"``), itself, or a function of a scan and a grid
 that gives a volume in HU."""
+
+
+def listed(what: Any) -> Sequence[Any]:
+    """One of something as a list of one, several as they are."""
+    return list(what) if isinstance(what, list | tuple | np.ndarray) else [what]
 
 
 def method_of(spec: MethodLike) -> Method:
@@ -181,10 +188,13 @@ def _named(spec: str) -> Method:
     if name == "fbp":
         kernel = rest or "standard"
         return Method(
-            f"fbp:{kernel}", lambda draw: draw.fbp(kernel), kernels=(kernel,), is_fbp=True
+            f"fbp:{kernel}",
+            lambda realisation: realisation.fbp(kernel),
+            kernels=(kernel,),
+            is_fbp=True,
         )
     if name == "pwls":
-        return Method("pwls", lambda draw: draw.pwls())
+        return Method("pwls", lambda realisation: realisation.pwls())
     if name == "mbir":
         return _mbir(spec, rest)
     if name == "files":
@@ -211,8 +221,8 @@ def denoiser(function: Callable[..., Any], base: Any, name: str = "") -> Method:
     plain = getattr(function, "__name__", "denoiser")
     denoise = denoiser_of(function)
 
-    def run(draw: Realisation) -> Any:
-        return denoise(before.run(draw), lambda: draw.sigma(before))
+    def run(realisation: Realisation) -> Any:
+        return denoise(before.run(realisation), lambda: realisation.sigma(before))
 
     name = name or f"{plain}@{before.name}"
     made = denoiser, (function, before, name)
@@ -223,10 +233,12 @@ def _filtered(name: str, base: str, spec: str) -> Method:
     """A filter of :mod:`recon.evaluate.rivals` with the settings that were tuned for it."""
     before, name = method_of(base), filter_name(name)
 
-    def run(draw: Realisation) -> Tensor:
-        settings = tuned(name, before.kernels[0], draw.exposure_s)
+    def run(realisation: Realisation) -> Tensor:
+        settings = tuned(name, before.kernels[0], realisation.exposure_s)
         smooths = settings.get("sigma", SMOOTHED_BY.get(name, 0.0)) if name in SMOOTHED_BY else 0.0
-        found: Tensor = FILTERS[name](before.run(draw), draw.sigma(before, smooths), **settings)
+        found: Tensor = FILTERS[name](
+            before.run(realisation), realisation.sigma(before, smooths), **settings
+        )
         return found
 
     return Method(spec, run, key="tuned", kernels=before.kernels)
@@ -250,20 +262,26 @@ def _mbir(spec: str, rest: str) -> Method:
     # Others need not be differentiable: what is drawn of them is controlled by the reference.
     differentiable = "tissues" not in given and (prior is None or prior is bilateral_prior)
     return Method(
-        spec, lambda draw: draw.mbir(network), key=key, network=network if differentiable else None
+        spec,
+        lambda realisation: realisation.mbir(network),
+        key=key,
+        network=network if differentiable else None,
     )
 
 
 def _of_function(name: str, function: Callable[..., Any]) -> Method:
     made = _of_function, (name, function)
     return Method(
-        name, lambda draw: function(draw.scan, draw.grid), key=_source_of(function), made=made
+        name,
+        lambda realisation: function(realisation.scan, realisation.grid),
+        key=_source_of(function),
+        made=made,
     )
 
 
 def _of_files(spec: str, folder: Path) -> Method:
-    def run(draw: Realisation) -> Tensor:
-        task, name = draw.label.split("/")
+    def run(realisation: Realisation) -> Tensor:
+        task, name = realisation.label.split("/")
         wanted = (name, *(f"{name}_{method}" for method in ("fbp", "pwls", "mbir")))
         there = volume_files(folder / task) or volume_files(folder)
         found = [there[n] for n in wanted if n in there]
@@ -274,12 +292,12 @@ def _of_files(spec: str, folder: Path) -> Method:
             )
         if not found:
             raise FileNotFoundError(
-                f"{folder} holds no volume {draw.label}, by itself or with _fbp, _pwls or _mbir "
-                "behind: reconstruct the exported scan of that name"
+                f"{folder} holds no volume {realisation.label}, by itself or with _fbp, _pwls or "
+                "_mbir behind: reconstruct the exported scan of that name"
             )
         volume = Volume.load(found[0])
-        if not same_grid(volume.grid, draw.grid):
-            raise ValueError(f"{found[0]} lies on {volume.grid}, the task on {draw.grid}")
+        if not same_grid(volume.grid, realisation.grid):
+            raise ValueError(f"{found[0]} lies on {volume.grid}, the task on {realisation.grid}")
         if volume.unit != "HU":
             raise ValueError(f"{found[0]} is in {volume.unit}, not in HU")
         return volume.data

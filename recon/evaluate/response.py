@@ -1,11 +1,11 @@
 """The linear response of MBIR to the noise of its data: the best linear control of its figures.
 
-A backward pass gives g = ∂(ROI mean)/∂b of b = AᵀW y, and g·b of every draw costs nothing. Any
-functional g·b has the exactly known mean g·E[b] and covariance gᵀ Cov(b) g of the readings' noise,
-whatever the method; the closer g follows the method, the higher the correlation, and the fewer
-draws an interval needs (:mod:`torchpcct.metrics.control`). For Gaussian noise the best g of all is
-the gradient's expectation over the noise (Stein 1981, Ann. Statist. 9:1135, lemma 1), here its mean
-over a few draws that serve nothing else.
+A backward pass gives g = ∂(ROI mean)/∂b of b = AᵀW y, and g·b of every realisation costs nothing.
+Any functional g·b has the exactly known mean g·E[b] and covariance gᵀ Cov(b) g of the readings'
+noise, whatever the method; the closer g follows the method, the higher the correlation, and the
+fewer realisations an interval needs (:mod:`torchpcct.metrics.control`). For Gaussian noise the best
+g of all is the gradient's expectation over the noise (Stein 1981, Ann. Statist. 9:1135, lemma 1),
+here its mean over a few realisations that serve nothing else.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 _DRAWS = 2
 """Of the noise that the gradient is averaged over."""
 _SEED = 1 << 40
-"""Of these draws: apart from all realisations."""
+"""Of these realisations: apart from all realisations."""
 
 
 def response(

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from recon.api import reconstruct
 from recon.evaluate.measure import volume_of
-from recon.evaluate.methods import Method, MethodLike, method_of, noise_of
+from recon.evaluate.methods import Method, MethodLike, listed, method_of, noise_of
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.equal_resolution import noise_at_equal_resolution
 from torchpcct.metrics.half_split import HalfSplit, halves
@@ -45,7 +45,7 @@ _SAME_LIGHT = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredDraw:
+class MeasuredRealisation:
     """A measured scan, in the form that methods ask for.
 
     Attributes:
@@ -109,7 +109,7 @@ def evaluate_scans(
         n: pairs of noise realisations that are measured. The first is the two scans as they are;
             for each further one views drawn at random are exchanged between them, which makes two
             other scans with independent noise.
-        seed: of that draw.
+        seed: of that realisation.
 
     Returns:
         What :func:`evaluate_volumes` gives, for a dose of ONE of the scans; of ``n`` pairs the
@@ -149,17 +149,17 @@ def evaluate_scans(
             "views can be exchanged between scans of one exposure only: these have two; leave out n"
         )
     given, grid = [as_slices(s, grid)[0] for s in given], as_slices(given[0], grid)[1]
-    names = [method_of(m) for m in (methods if isinstance(methods, list | tuple) else [methods])]
+    names = [method_of(m) for m in listed(methods)]
     weighted = [m.name for m in names if m.energies is not None]
     if weighted:
         raise ValueError(
             f"{', '.join(weighted)}: energies= weighs the bins of simulated scans; weigh those of "
             "measured ones before, scan.weighted(torchpcct.spectral.bin_weights(…))"
         )
-    draw = np.random.default_rng(seed)
+    generator = np.random.default_rng(seed)
     rows = []
     for k in range(n):
-        pair = given if k == 0 else _exchanged(given, draw)
+        pair = given if k == 0 else _exchanged(given, generator)
         found, reference = _reconstructed(pair, grid, names)
         measured = evaluate_volumes(found, reference, grid.spacing, region)
         rows.append([{**row, "note": _note(given[0], grid)} for row in measured])
@@ -177,11 +177,11 @@ def as_slices(scan: Scan, grid: VolumeGrid) -> tuple[Scan, VolumeGrid]:
     )
 
 
-def _exchanged(pair: Sequence[Scan], draw: np.random.Generator) -> list[Scan]:
+def _exchanged(pair: Sequence[Scan], generator: np.random.Generator) -> list[Scan]:
     """Two scans whose views are those of the two that are given, each of either."""
     first, second = pair
     axes = len(first.geometry.shape)
-    views = torch.from_numpy(draw.random(first.geometry.views) < 0.5).to(first.counts.device)
+    views = torch.from_numpy(generator.random(first.geometry.views) < 0.5).to(first.counts.device)
     other = views.reshape(-1, *(1,) * (axes - 1))
 
     def mixed(a: Scan, b: Scan) -> Scan:
@@ -214,7 +214,7 @@ def _reconstructed(
     def volumes(method: Method) -> list[Tensor]:
         if method.name not in kept:
             kept[method.name] = [
-                volume_of(method, MeasuredDraw(scan, grid, noise)) for scan in pair
+                volume_of(method, MeasuredRealisation(scan, grid, noise)) for scan in pair
             ]
         return kept[method.name]
 

@@ -10,11 +10,11 @@ import torch
 from refusals import refused
 from tiny_studies import INSERT
 
-from recon.evaluate.draws import Draws
-from recon.evaluate.energies import EnergyDraws, mean_paths, with_bins
+from recon.evaluate.energies import EnergyRealisations, mean_paths, with_bins
 from recon.evaluate.experiment import evaluate
 from recon.evaluate.methods import Method, method_of
 from recon.evaluate.names import check_method
+from recon.evaluate.realisations import Realisations
 from recon.evaluate.tasks import read_task
 from recon.jobs.store import Store
 from recon.names import split_energies, split_method
@@ -24,8 +24,8 @@ IODINE = "iodine 10 mg/ml in soft_tissue"
 OWN = "fbp:soft,energies"
 
 
-def drawn(draw):
-    return draw.fbp("soft")
+def drawn(realisation):
+    return realisation.fbp("soft")
 
 
 @pytest.fixture(scope="module")
@@ -92,15 +92,15 @@ def test_weighted_volumes_are_in_hu_of_their_own(found):
 
 def test_realisations_are_those_of_the_summed_counts(task, folder):
     """The same photons: with the weight 1 in all bins the noise is that of the plain sum."""
-    base = Draws(task, Store(folder / task.name), 0, ("soft",))
-    weighted = EnergyDraws(base, "task", ())
+    base = Realisations(task, Store(folder / task.name), 0, ("soft",))
+    weighted = EnergyRealisations(base, "task", ())
     weighted.weights[:] = 1.0
-    pair = [draws.draw(20.0, 3) for draws in (base, weighted)]
+    pair = [realisations.pair(20.0, 3) for realisations in (base, weighted)]
     for plain, split in zip(*pair, strict=True):
         torch.testing.assert_close(split.scan.counts, plain.scan.counts, rtol=1e-4, atol=1e-3)
         assert (split.fbp("soft") - plain.fbp("soft")).abs().max() < 0.2
-    other = EnergyDraws(base, "iodine", ())
-    noisy = other.draw(20.0, 3)[0].scan
+    other = EnergyRealisations(base, "iodine", ())
+    noisy = other.pair(20.0, 3)[0].scan
     clean = other.clean[0]
     z = (noisy.counts / 20.0 - clean.counts) / (clean.quantum * clean.counts / 20.0).sqrt()
     assert float(z.square().mean()) == pytest.approx(1.0, abs=5 * (2 / z.numel()) ** 0.5)
@@ -144,13 +144,16 @@ def test_what_is_refused(task, folder):
         ("is given none", lambda: check_method("files:out,energies=iodine")),
         ("option of evaluations", lambda: split_method("fbp:soft,energies=iodine")),
         ("paint their tissues", lambda: evaluate(painted, OWN, n=8, folder=folder)),
-        ("painted in HU", lambda: EnergyDraws(Draws(painted, Store(folder / "t")), "", ())),
+        (
+            "painted in HU",
+            lambda: EnergyRealisations(Realisations(painted, Store(folder / "t")), "", ()),
+        ),
         (
             "Scintillator without energy bins",
-            lambda: EnergyDraws(Draws(integrating, Store(folder / "t")), "", ()),
+            lambda: EnergyRealisations(Realisations(integrating, Store(folder / "t")), "", ()),
         ),
         (
             "attenuate alike",
-            lambda: EnergyDraws(Draws(task, Store(folder / "t")), "water/water", ()),
+            lambda: EnergyRealisations(Realisations(task, Store(folder / "t")), "water/water", ()),
         ),
     )

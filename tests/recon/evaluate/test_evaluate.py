@@ -14,12 +14,12 @@ import yaml
 from scipy import ndimage
 from tiny_studies import INSERT
 
-from recon.evaluate.draws import Draws
 from recon.evaluate.estimates import _Figures, pivot
 from recon.evaluate.experiment import evaluate
 from recon.evaluate.measure import Reader, kept_as
 from recon.evaluate.methods import Method, denoiser, method_of
 from recon.evaluate.names import TASKS
+from recon.evaluate.realisations import Realisations
 from recon.evaluate.report import COLUMNS, save, text_of
 from recon.evaluate.rivals import tuned
 from recon.evaluate.tasks import AnatomyTask, VesselTask, read_task, task_text
@@ -67,8 +67,8 @@ def found(task, folder):
     return evaluate(task, methods, n=8, folder=folder)
 
 
-def run_half(draw):
-    return halved(draw.scan, draw.grid)
+def run_half(realisation):
+    return halved(realisation.scan, realisation.grid)
 
 
 def value(found, figure, method, where):
@@ -124,7 +124,7 @@ def test_linear_methods_are_exact(found):
 
 def test_exact_variance_is_that_of_draws(task, folder):
     """FBP passed off as a nonlinear method: drawn figures about the exact ones."""
-    other = Method("drawn", lambda draw: draw.fbp("detail"), kernels=("detail",))
+    other = Method("drawn", lambda realisation: realisation.fbp("detail"), kernels=("detail",))
     both = evaluate(task, ["fbp:detail", other], n=40, folder=folder)
     for figure, where in (
         ("contrast SD at slope 1", "lesion"),
@@ -154,7 +154,7 @@ def test_a_users_denoiser_and_reconstruction(found):
 
 
 def test_a_second_call_computes_nothing_again(task, folder, found):
-    def never(draw):
+    def never(realisation):
         raise AssertionError("this piece was finished")
 
     again = evaluate(task, ["fbp:soft", Method("mine", never)], n=8, folder=folder)
@@ -450,8 +450,8 @@ def test_pwls_is_that_of_a_user(task, folder):
     without."""
     from recon import reconstruct
 
-    for draw in Draws(task, Store(folder / task.name)).draw(20.0, 3):
-        theirs, ours = reconstruct(draw.scan, task.grid, "pwls").data, draw.pwls()
+    for realisation in Realisations(task, Store(folder / task.name)).pair(20.0, 3):
+        theirs, ours = reconstruct(realisation.scan, task.grid, "pwls").data, realisation.pwls()
         assert float((ours - theirs).square().mean().sqrt()) < 0.1
         assert float((ours - theirs).abs().max()) < 1.0
 

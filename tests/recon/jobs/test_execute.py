@@ -140,7 +140,7 @@ def names(folder):
 def test_processes_give_the_same_figures(task, serial, processes, tmp_path, monkeypatch):
     own = []
     monkeypatch.setattr(
-        "recon.evaluate.measure.volume_of", lambda method, draw: own.append(method.name)
+        "recon.evaluate.measure.volume_of", lambda method, realisation: own.append(method.name)
     )
     found = evaluate(task, METHODS, n=8, folder=tmp_path, executor=processes)
     assert own == []  # nothing was left for this process
@@ -294,7 +294,7 @@ def warnings_off():
 
 
 def test_a_lambda_is_computed_here(task, processes, tmp_path, caplog):
-    mine = Method("mine", lambda draw: draw.fbp("soft"), kernels=("soft",))
+    mine = Method("mine", lambda realisation: realisation.fbp("soft"), kernels=("soft",))
     found = evaluate(task, ["fbp:soft", mine], n=8, folder=tmp_path, executor=processes)
     assert {r["method"] for r in found.records} == {"fbp:soft", "mine"}
     assert "mine is computed here, not by other processes" in caplog.text
@@ -761,7 +761,7 @@ def test_a_dry_run_lists_the_jobs(here, cli):
 CALLED = """
 import pickle, sys
 from pathlib import Path
-from recon.evaluate.draws import Draws
+from recon.evaluate.realisations import Draws
 from recon.evaluate.measure import Measurement, Reader
 from recon.jobs.sources import _follow
 from recon.jobs.store import Store

@@ -35,10 +35,10 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 
 _SIGMA_SEEDS = (900_001, 900_002)
-"""Draws that a denoiser's noise level is measured on; none of them is evaluated."""
+"""Realisations that a denoiser's noise level is measured on; none of them is evaluated."""
 
 
-class Draws:
+class Realisations:
     """All realisations of one task.
 
     Args:
@@ -144,7 +144,7 @@ class Draws:
         """Without noise; ``exposure_s`` is what a method is told."""
         return Simulated(self, self.clean[0 if present else 1], exposure_s, -1, present)
 
-    def draw(self, exposure_s: float, k: int) -> tuple[Simulated, Simulated]:
+    def pair(self, exposure_s: float, k: int) -> tuple[Simulated, Simulated]:
         """Realisation ``k`` with and without the signal."""
         noisy = self.clean[0].with_noise(exposure_s, self.seed + k if k < _SIGMA_SEEDS[0] else k)
         present = Simulated(self, noisy, exposure_s, k, True)
@@ -162,7 +162,7 @@ class Draws:
             clean = method.run(self.noise_free(True, exposure_s))
             found = [
                 noise_of(
-                    method.run(self.draw(exposure_s, k)[0]) - clean,
+                    method.run(self.pair(exposure_s, k)[0]) - clean,
                     self.task.flat[largest],
                     smooths,
                 )
@@ -185,32 +185,32 @@ class Simulated:
 
     def __init__(
         self,
-        draws: Draws,
+        realisations: Realisations,
         scan: Scan | None,
         exposure_s: float,
         k: int,
         present: bool,
         with_signal: Simulated | None = None,
     ) -> None:
-        self._draws, self._scan, self._with_signal = draws, scan, with_signal
+        self._realisations, self._scan, self._with_signal = realisations, scan, with_signal
         self.exposure_s, self.k, self.present = exposure_s, k, present
         self.drawn: bool | None = None
         self.warned: bool | None = None
 
     @property
     def grid(self) -> VolumeGrid:
-        return self._draws.task.grid
+        return self._realisations.task.grid
 
     @property
     def label(self) -> str:
         number = "clean" if self.k < 0 else f"{self.k:03d}"
         state = "present" if self.present else "absent"
-        return f"{self._draws.task.name}/{self.exposure_s:g}s_{number}_{state}"
+        return f"{self._realisations.task.name}/{self.exposure_s:g}s_{number}_{state}"
 
     @property
     def problem(self) -> InsetProblem:
         """The inset's, shared by all realisations."""
-        return self._draws.problem
+        return self._realisations.problem
 
     @cached_property
     def scan(self) -> Scan:
@@ -218,7 +218,7 @@ class Simulated:
         if self._scan is not None:
             return self._scan
         assert self._with_signal is not None
-        present, absent = self._draws.clean
+        present, absent = self._realisations.clean
         return replace(
             self._with_signal.scan,
             counts=self._with_signal.scan.counts * (absent.counts / present.counts),
@@ -227,28 +227,28 @@ class Simulated:
     @cached_property
     def _fbp(self) -> Tensor:
         if self.k < 0:
-            return self._draws.clean_fbp[0 if self.present else 1]
+            return self._realisations.clean_fbp[0 if self.present else 1]
         if self._with_signal is not None:
-            present, absent = self._draws.clean_fbp
+            present, absent = self._realisations.clean_fbp
             return self._with_signal._fbp - (present - absent)
-        return self._draws.filtered(self.scan)[0]
+        return self._realisations.filtered(self.scan)[0]
 
     def fbp(self, kernel: str) -> Tensor:
         """HU ``(z, y, x)``."""
-        if kernel not in self._draws.kernels:
+        if kernel not in self._realisations.kernels:
             raise ValueError(
                 f"FBP with the kernel {kernel!r} was not announced: Method(..., "
                 f"kernels=({kernel!r},))"
             )
-        return self._fbp[self._draws.kernels.index(kernel)]
+        return self._fbp[self._realisations.kernels.index(kernel)]
 
     @cached_property
     def term(self) -> Quadratic:
         """What the readings say, for PWLS and MBIR: a batch of one."""
         if self.k < 0:
-            return self._draws.clean_terms[0 if self.present else 1].times(self.exposure_s)
+            return self._realisations.clean_terms[0 if self.present else 1].times(self.exposure_s)
         if self._with_signal is not None:
-            present, absent = self._draws.clean_terms
+            present, absent = self._realisations.clean_terms
             other = self._with_signal.term
             b = other.b - self.exposure_s * (present.b - absent.b)
             return replace(other, b=b, energy=None)
@@ -273,4 +273,4 @@ class Simulated:
 
     def sigma(self, method: Method, smooths: float = 0.0) -> float:
         """Noise in HU of a linear method at this exposure in the largest tissue."""
-        return self._draws.sigma(method, self.exposure_s, smooths)
+        return self._realisations.sigma(method, self.exposure_s, smooths)
