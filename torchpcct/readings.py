@@ -543,15 +543,17 @@ def interpolate_dead(lines: Tensor, dead: Tensor, rows: bool, most: float = MOST
 def _interpolated_along(
     values: Tensor, dead: Tensor, axes: Sequence[tuple[int, bool]]
 ) -> tuple[Tensor, Tensor]:
-    """:func:`_interpolated` along one axis after the other, until nothing is dead."""
+    """:func:`_filled_along_axis` along one axis after the other, until nothing is dead."""
     for axis, between in axes:
         if not bool(dead.any()):
             break
-        values, dead = _interpolated(values, dead, axis, between)
+        values, dead = _filled_along_axis(values, dead, axis, between)
     return values, dead
 
 
-def _interpolated(values: Tensor, dead: Tensor, axis: int, between: bool) -> tuple[Tensor, Tensor]:
+def _filled_along_axis(
+    values: Tensor, dead: Tensor, axis: int, between: bool
+) -> tuple[Tensor, Tensor]:
     """Linear interpolation over the dead along one axis, and what stays dead.
 
     Args:
