@@ -136,8 +136,8 @@ def calibrate(
     """Numbers of a scan's geometry from the object itself.
 
     Needs the whole object in all views, and a grid that holds it; voxels of about a cell as it is
-    seen at the axis, or larger. Bodies of plastic and teeth do; what is round about the axis says
-    nothing about roll.
+    seen at the axis, or larger. The errors are those of the readings' noise, larger by what else
+    the volume leaves of them.
 
     Args:
         scan: counting or energy integrating, without energy bins, on the whole detector, which is
