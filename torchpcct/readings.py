@@ -430,7 +430,7 @@ def log_bias(mean: Tensor) -> Tensor:
     """
     known, bias = _log_bias()
     if mean.device.type != "cpu":
-        return _interpolated((mean + 0.5 / _AVERAGED).log(), known, bias, math.log(MANY))
+        return _of_table((mean + 0.5 / _AVERAGED).log(), known, bias, math.log(MANY))
     # The logarithm of the estimate is biased, too: ½ a count in those that it was made of.
     m = mean + 0.5 / _AVERAGED
     dim = m < MANY
@@ -438,7 +438,7 @@ def log_bias(mean: Tensor) -> Tensor:
     return torch.zeros_like(mean).masked_scatter_(dim, torch.from_numpy(found).to(mean.dtype))
 
 
-def _interpolated(
+def _of_table(
     at: Tensor, known: NDArray[np.float64], values: NDArray[np.float64], end: float
 ) -> Tensor:
     """``numpy.interp`` with torch, 0 from ``end`` on: on any device, for all readings alike."""

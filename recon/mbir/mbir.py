@@ -81,6 +81,7 @@ class Mbir:
         self.fidelity = fidelity
         self.parts = parts
         self.known: Known | None = None
+        self._sha256 = ""
         self.voxel_mm = model.voxel_mm
 
     @classmethod
@@ -151,7 +152,7 @@ class Mbir:
     def weights_sha256(self) -> str:
         """SHA-256 of the weights' names, types, shapes and values, as in the record of their
         training."""
-        return digest(self.model.state_dict())
+        return self._sha256 or digest(self.model.state_dict())
 
     def normal(self, term: Quadratic) -> Quadratic:
         """A data term in noise units, on the voxels that the network knows.
@@ -307,6 +308,7 @@ class Mbir:
         if all(t.device == target for t in tensors):
             return self
         other = copy.copy(self)
+        other._sha256 = self.weights_sha256  # copies of all weights would travel for it
         other.model = copy.deepcopy(self.model).to(target)
         if len(held) > 1:
             other.parts = {**self.parts, "prior": copy.deepcopy(held[1]).to(target)}

@@ -101,6 +101,21 @@ def test_a_scan_on_a_device_is_reconstructed_there():
     torch.testing.assert_close(volume, expect.data, rtol=0, atol=0.01)
 
 
+def test_line_integrals_and_weights_are_made_on_the_device():
+    """Of few counts, whose logarithm is biased, with dead readings and water that hardens."""
+    scan = _scan(*SCANS["cone"], photons=6.0)
+    dead = torch.zeros_like(scan.counts, dtype=torch.bool)
+    dead[2, 3, 4:6] = dead[5, 2] = True
+    scan = replace(scan, dead=dead)
+    with standin() as counter:
+        there = scan.to(DEVICE)
+        lines, weights = there.line_integrals(), there.weights()
+        assert not counter.copies
+        found = lines.cpu(), weights.cpu()
+    torch.testing.assert_close(found[0], scan.line_integrals(), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(found[1], scan.weights(), rtol=1e-5, atol=1e-5)
+
+
 def test_gradients_of_the_projector_and_of_fbp_stay_on_the_device():
     geometry, grid = SCANS["fan"]
     A = Projector(geometry, grid)
