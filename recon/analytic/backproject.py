@@ -93,6 +93,15 @@ def data_shape(geometry: Geometry, window: DetectorWindow) -> tuple[int, ...]:
     return (window.views, window.columns)
 
 
+@functools.lru_cache(maxsize=16)
+def _shared_views(geometry: Beam, grid: VolumeGrid, moving: bool) -> Orbits:
+    """Views of a slice that share positions and weights: no two, unless the grid lies on itself
+    after every turn and reflection."""
+    found = find_orbits(geometry, grid, rays_of(geometry), moving)
+    placed = place(found.operations, grid)
+    return no_orbits(geometry.views) if placed.apart or placed.shift.any() else found
+
+
 class BackprojectionPlan:
     """Geometry of one backprojection, and its two maps for numba; arguments as of
     :func:`backproject`."""
@@ -461,10 +470,7 @@ class BackprojectionPlan:
     @functools.cached_property
     def _orbits(self) -> Orbits:
         """Of a slice: which views share positions and weights."""
-        rays = rays_of(self.geometry)
-        found = find_orbits(self.geometry, self.grid, rays, bool(self.shifts.any()))
-        placed = place(found.operations, self.grid)
-        return no_orbits(rays.views) if placed.apart or placed.shift.any() else found
+        return _shared_views(self.geometry, self.grid, bool(self.shifts.any()))
 
     def _inside(self) -> NDArray[np.int64]:
         """Of a slice: ``(Y, 2)``, the first pixel of each line that some view sees, and the one
