@@ -81,8 +81,8 @@ def height_of(drawn: Drawn) -> float:
 
 
 def as_fine_as_cells(drawn: Drawn) -> VolumeGrid:
-    """The whole field in voxels as large as cells at the axis, and all slices of the object: others
-    cannot hold what the readings say."""
+    """The whole field in voxels as large as cells at the axis, and all slices of the object, of a
+    row each: others cannot hold what the readings say."""
     g = drawn.geometry
     if drawn.kind == "parallel":
         cell, radius = g.pitch, float(np.abs(g.column_positions).max()) + g.pitch / 2
@@ -92,9 +92,12 @@ def as_fine_as_cells(drawn: Drawn) -> VolumeGrid:
     side = max(2, math.ceil(2.0 * radius / cell))
     if drawn.kind != "cone":
         return VolumeGrid((side, side), cell)
-    row = g.pitch[0] / g.magnification
-    slices = max(1, math.ceil(2.0 * height_of(drawn) / row))
-    return VolumeGrid((slices, side, side), (row, cell, cell))
+    row, height = g.pitch[0] / g.magnification, height_of(drawn)
+    lowest = float(g.row_positions[0]) / g.magnification - row / 2
+    first = math.floor((-height - lowest) / row + 1e-9)
+    last = max(math.ceil((height - lowest) / row - 1e-9), first + 1)
+    middle = lowest + row * (first + last) / 2
+    return VolumeGrid((last - first, side, side), (row, cell, cell), (middle, 0.0, 0.0))
 
 
 def of_the_scan(texts: list[str]) -> list[str]:

@@ -25,7 +25,7 @@ BALL = 0
 CYLINDER = 1
 BOX = 2
 KINDS = ("parallel", "fan", "cone")
-DENSITIES = ((0.02, 0.05), (0.3, 0.6), (2.0, 7.5))
+DENSITIES = ((0.02, 0.05), (0.3, 0.6), (2.0, 7.0))
 """Attenuation over that of water of foam, of wood, and of stone and metal."""
 
 
@@ -586,9 +586,10 @@ def draw(seed: int, *, kind: str | None = None, readings: int = 600_000) -> Draw
         solids = [replace(s, value=s.value * wanted / densest) for s in solids]
         water *= wanted / densest
     # Foam, wood, or stone and metal, by their attenuation over that of water. What is as light as a
-    # tenth of it, or as heavy as ten times, is also water in another unit.
+    # tenth of it, or as heavy as ten times, is also water in another unit: no parts of several
+    # densities.
     rng_of_density = np.random.default_rng([seed, 3])
-    if rng_of_density.random() < 0.25:
+    if rng_of_density.random() < 0.25 and not name.startswith(("several", "shell")):
         low, high = DENSITIES[int(rng_of_density.integers(len(DENSITIES)))]
         density = rng_of_density.uniform(low, high)
         name += f" of {density:.2g} times water"

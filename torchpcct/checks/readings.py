@@ -33,6 +33,19 @@ OFFSET_SHARE = 0.05
 """Offset, over the darkest readings, from which it is named."""
 OFFSET_SIGMAS = 4.5
 """Standard errors to which an offset must be known to be named."""
+LOST_SHARE = 0.05
+"""Part of the variance that the brightest readings lack, from which it is named; a detector that
+loses a share x of its counts lacks 2 x."""
+LOST_SIGMAS = 4.5
+"""Standard errors to which it must be known."""
+_QUARTILE_ERROR = 2.8
+"""Relative error of a variance by the quartiles of n second differences, times √n."""
+_DARK_SHARE = 0.3
+"""Part of what bright readings lack that dark ones may lack, being fewer: filters take all."""
+_BRIGHT = 0.85
+"""Part of the brightest mean above which readings are bright."""
+_DARK = 0.2
+"""Part of the brightest mean below which readings are dark."""
 _LEAST_COLUMNS = 24
 """Columns of a detector that is tested."""
 _LEAST_VIEWS = 16
@@ -75,8 +88,8 @@ def reading_warnings(scan: Scan) -> list[str]:
     quantum = 1.0 if scan.quantum is None else float(scan.quantum.median())
     # Of transmissions the noise says nothing of the photons in each cell.
     unknown = str(scan.info.get("signal_of_one_photon_from")).startswith("noise")
-    offset = [] if unknown else _offset(counts, quantum)
-    return dim + (_clipped(counts, quantum) or offset or _brighter_than_air(lines))
+    transfer = [] if unknown else _transfer_texts(counts, quantum)
+    return dim + (_clipped(counts, quantum) or transfer or _brighter_than_air(lines))
 
 
 def without_light(scan: Scan) -> list[str]:
@@ -205,15 +218,66 @@ def _clipped(counts: NDArray[np.float64], quantum: float) -> list[str]:
     ]
 
 
-def _offset(counts: NDArray[np.float64], quantum: float) -> list[str]:
+def _transfer_texts(counts: NDArray[np.float64], quantum: float) -> list[str]:
+    """What is wrong with the variance of readings of a mean: over an offset, or of a detector that
+    loses counts."""
+    # From view to view: there details change least, and cells of a scintillator share no light.
+    classes = _transfer(np.moveaxis(counts, 0, -1), np.nanquantile(counts, _CLASSES))
+    return _offset(*classes, quantum) or _lost_counts(*classes, quantum)
+
+
+def _lost_counts(
+    mean: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    number: NDArray[np.int64],
+    quantum: float,
+) -> list[str]:
+    """Bright readings whose noise is that of fewer photons than they count, beside dark ones whose
+    noise is right.
+
+    A dead time τ spaces the counts of a rate a more evenly: their variance over their mean is
+    1 − 2 a τ exp(−a τ) if pulses prolong it, and 1 / (1 + a τ)² if not (Yu and Fessler, Phys. Med.
+    Biol. 45, 2043, 2000); both lose a share a τ of the counts, to first order. Filters and
+    neighbours that share light take as much of the noise of dark readings.
+    """
+    known = (number >= 100) & (variance > 0) & (mean > DIM * quantum)
+    if not known.any():
+        return []
+    m, weight = mean[known], number[known].astype(float)
+    ratio = variance[known] / (m * quantum)
+    top = float(m.max())
+    bright, dark = m > _BRIGHT * top, m < _DARK * top
+    if not (bright.any() and dark.any()):
+        return []
+    # Details of the object add to some classes, and never take.
+    brightest, darkest = (float(np.average(ratio[k], weights=weight[k])) for k in (bright, dark))
+    errors = [_QUARTILE_ERROR / math.sqrt(float(weight[k].sum())) for k in (bright, dark)]
+    least = darkest - LOST_SIGMAS * darkest * errors[1]
+    if brightest * (1.0 + LOST_SIGMAS * errors[0]) > min(1.0 - LOST_SHARE, least):
+        return []
+    if 1.0 - np.median(ratio[dark]) > _DARK_SHARE * (1.0 - brightest):
+        return []
+    return [
+        f"the brightest readings have {100.0 * (1.0 - brightest):.2g} % less variance than photons "
+        "have, the darkest do not: as of a detector that loses "
+        f"{50.0 * (1.0 - brightest):.2g} % of its counts in air to its dead time (pile-up), and "
+        "less behind the object, which reads too low; correct the readings and air for the dead "
+        "time, or calibrate in water at the same tube current"
+    ]
+
+
+def _offset(
+    mean: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    number: NDArray[np.int64],
+    quantum: float,
+) -> list[str]:
     """Readings over an offset: their noise is that of fewer photons than they count.
 
     The variance of readings m, from the differences between views, is F (m - D) + c m²: F is the
     signal of a photon, D the offset, and c what details of the object add (Janesick 2007, with the
     object in the beam).
     """
-    # From view to view: there details change least, and cells of a scintillator share no light.
-    mean, variance, number = _transfer(np.moveaxis(counts, 0, -1), np.nanquantile(counts, _CLASSES))
     many = (number >= 100) & (variance > 0) & (mean > 0)
     if many.sum() < _LEAST_CLASSES:
         return []

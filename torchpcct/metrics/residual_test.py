@@ -45,7 +45,9 @@ reading is none at an edge: of a step voxels leave a third at most, 0.1 of the v
 EDGE = 1.0 / 3.0
 """Part of such a step that voxels leave at most."""
 _FEWEST_QUIET = 200
-"""Readings without edges below which all are tested alike."""
+"""Readings without edges below which χ² beside edges is not tested."""
+_FEWEST_BENDS = 8
+"""Cells with two neighbours from which the variance of their gains is known."""
 GAIN_TOLERANCE = 0.001
 """Gain error (rms over views or rows) that a sound scan may have: calibration, and what voxels
 cannot show."""
@@ -53,6 +55,13 @@ CENTRE_TOLERANCE = 0.05
 """Columns beside their place that are no finding: noise in millions of readings tells a hundredth,
 which voxels and interpolation leave. A reconstruction takes most of an error up: a column off
 leaves the more."""
+LEAK = (0.02, 0.06)
+"""Part of what voxels leave at edges, in χ², that looks like a shift of the columns, or that the
+fit spreads over the other readings of whole views or rows, where nothing is wrong: of thin plates
+and caps between two slices 2 % and up to 4 %; and what is added of it beyond :data:`COARSE`, where
+a finding says that voxels are too coarse."""
+_ROWS = 10
+"""Rows of which this part is so much; of fewer it is more."""
 _DENSE = 0.8
 """Quantile of the line integrals from which on rays are dense: the densest fifth."""
 _DENSE_SHARE = 2.0
@@ -131,7 +140,8 @@ def residual_test(
     along = [_steps(lines, axis) for axis in range(3)]
     largest = torch.stack(along).amax(0)
     quiet = w * largest.square() <= QUIET
-    if int((quiet & (w > 0)).sum()) < _FEWEST_QUIET:
+    few = int((quiet & (w > 0)).sum()) < min(_FEWEST_QUIET, count / 2)
+    if few:
         quiet = torch.ones_like(quiet)
     calm, calm_r = torch.where(quiet, w, 0.0), torch.where(quiet, wr, 0.0)
 
@@ -140,7 +150,9 @@ def residual_test(
     number_calm = int((calm > 0).sum())
     chi2_calm = float((calm_r * r).sum()) / number_calm
     spread, spread_calm = math.sqrt(2.0 / count), math.sqrt(2.0 / number_calm)
-    above = (chi2_calm - 1.0 - MISFIT - _gains(calm, calm_r) / number_calm) / spread_calm
+    gains = _gains(calm, calm_r, _gain_variance(calm, calm_r)) / number_calm
+    # Of edges alone nobody knows what voxels leave.
+    above = -math.inf if few else (chi2_calm - 1.0 - MISFIT - gains) / spread_calm
     below = (1.0 - MISFIT - min(unknowns / count, 1.0) - chi2) / spread
     coarse = (chi2 - 1.0 - MISFIT - COARSE) / spread
     p_values["level"] = float(min(1.0, 3.0 * stats.norm.sf(max(above, below, coarse))))
@@ -160,6 +172,14 @@ def residual_test(
                 "scan, or something outside of the grid was left out"
             )
 
+    of_voxels = w * (EDGE * largest).square()
+    # Of few rows those between two slices are many, of one row none are.
+    rows = max(1.0, _ROWS / residual.shape[1]) if residual.shape[1] > 1 else 1.0
+    leaks = rows * sum(
+        part * min(max(chi2 - 1.0 - least, 0.0) * count, float(of_voxels.sum()))
+        for part, least in zip(LEAK, (0.0, COARSE), strict=True)
+    )
+
     shifted = torch.zeros_like(lines)
     shifted[..., 1:-1] = (lines[..., 2:] - lines[..., :-2]) / 2.0
     power = float((w * shifted.square()).sum())
@@ -169,7 +189,8 @@ def residual_test(
             float(2.0 * stats.norm.sf(abs(score))),
             score / math.sqrt(power),
         )
-        if p_values["centre"] < level and abs(sizes["centre"]) > CENTRE_TOLERANCE:
+        large = abs(sizes["centre"]) > CENTRE_TOLERANCE and score * score > leaks
+        if p_values["centre"] < level and large:
             findings.append(
                 f"the readings lie {abs(sizes['centre']):.2g} columns or more beside what the "
                 f"volume projects to ({abs(score):.1f} standard deviations): the rotation centre "
@@ -181,17 +202,20 @@ def residual_test(
     level_rows = torch.where(w * along[1].square() <= QUIET, w, 0.0)
     if not bool((level_rows > 0).any()):
         level_rows = w
-    left = (level_rows * EDGE * largest).square()
     level_r = level_rows * r
+    of_cells = _gain_variance(level_rows, level_r)
     for name, axes, parts in (("views", (1, 2), 2), ("rows", (0, 2), 1)):
         weight, total = level_rows.sum(axes), level_r.sum(axes)
-        noisier = 1.0 + left.sum(axes) / weight.clamp_min(torch.finfo(weight.dtype).tiny)
+        # Of a cell's gain the views of a row have the same part.
+        by_cell = level_rows.square() if name == "views" else level_rows.sum(0).square()[None]
+        extra = (level_rows * of_voxels).sum(axes) + of_cells * by_cell.sum(axes)
+        noisier = 1.0 + extra / weight.clamp_min(torch.finfo(weight.dtype).tiny)
         weight, total = weight / noisier, total / noisier
         known = weight > 0
         scores = total[known] / weight[known].sqrt()
         # Every view alone, and the slow drifts over all of them, which add up what single views
         # cannot tell.
-        tolerated = GAIN_TOLERANCE**2 * float(weight.sum())
+        tolerated = GAIN_TOLERANCE**2 * float(weight.sum()) + leaks
         tails = [_upper_tail(float(scores.square().sum()), scores.numel(), tolerated)]
         if parts == 2 and scores.numel() > 4 * _HARMONICS:
             tails.append(_upper_tail(*_drift(total, weight), tolerated))
@@ -207,25 +231,44 @@ def residual_test(
 
 
 def _steps(lines: Tensor, axis: int) -> Tensor:
-    """The larger difference of each of ``(views, rows, columns)`` to a neighbour along an axis; 0
-    along one of two or fewer."""
+    """The larger difference of each of ``(views, rows, columns)`` to a neighbour along an axis."""
     found = torch.zeros_like(lines)
-    number_along = lines.shape[axis]
-    if number_along > 2:
-        step = lines.diff(dim=axis).abs()
-        for first in (0, 1):
-            part = found.narrow(axis, first, number_along - 1)
-            part.copy_(torch.maximum(part, step))
+    step = lines.diff(dim=axis).abs()
+    for first in (0, 1):
+        part = found.narrow(axis, first, step.shape[axis])
+        part.copy_(torch.maximum(part, step))
     return found
 
 
-def _gains(weight: Tensor, total: Tensor) -> float:
-    """What cells add to the sum of χ² that read too much or too little in all views, as far as
-    :data:`GAIN_TOLERANCE` goes: air is measured with noise, too."""
+def _gain_variance(weight: Tensor, total: Tensor) -> float:
+    """Variance of the gains of single cells, which the noise of air leaves: constant over the
+    views, and independent from column to column. At most that of one frame of air at the scan's own
+    exposure, whose noise is that of a reading.
+
+    Args:
+        weight: ``(views, rows, columns)``.
+        total: weight times residual.
+    """
+    cells, off = weight.sum(0), total.sum(0)
+    gains = off / cells
+    bend = gains[:, :-2] - 2.0 * gains[:, 1:-1] + gains[:, 2:]
+    of_noise = (1.0 / cells[:, :-2]) + 4.0 / cells[:, 1:-1] + 1.0 / cells[:, 2:]
+    known = torch.isfinite(bend) & torch.isfinite(of_noise)
+    if int(known.sum()) < _FEWEST_BENDS:
+        return 0.0
+    bend, of_noise = bend[known], of_noise[known]
+    # ⟨bend² / v⟩ = 1 + 6 σ² / v of bends whose noise has the variance v.
+    found = float((bend.square() / of_noise - 1.0).sum() / (6.0 / of_noise).sum())
+    return min(max(found, 0.0), 1.0 / float(weight[weight > 0].mean()))
+
+
+def _gains(weight: Tensor, total: Tensor, variance: float) -> float:
+    """What gains of cells add to the sum of χ²: those of this variance, and of all that are
+    constant over the views as far as :data:`GAIN_TOLERANCE` goes."""
     cells, off = weight.sum(0), total.sum(0)
     known = cells > 0
     excess = float((off[known].square() / cells[known] - 1.0).sum())
-    return min(max(excess, 0.0), GAIN_TOLERANCE**2 * float(cells.sum()))
+    return min(max(excess, 0.0), max(GAIN_TOLERANCE**2, variance) * float(cells.sum()))
 
 
 def _upper_tail(value: float, degrees: int, noncentrality: float) -> float:

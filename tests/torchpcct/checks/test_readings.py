@@ -63,6 +63,17 @@ def test_transmissions_are_no_counts():
     assert torch.equal(Scan.from_counts(low, FAN, air=60.0).counts, torch.from_numpy(low).float())
 
 
+def test_the_gain_is_that_of_air_frames_however_uneven_the_field():
+    """Behind a bowtie one photon was 1.7: each frame was divided by the reading of one cell."""
+    profile = np.exp(-1.5 * np.linspace(-1, 1, FAN.columns) ** 2)
+    rng = np.random.default_rng(5)
+    for gain in (1.0, 4.0):
+        frames = gain * rng.poisson(1e4 * profile * np.linspace(1.0, 1.1, 16)[:, None])
+        counts = gain * rng.poisson(1e4 * profile * SHONE)
+        scan = Scan.from_counts(counts.astype(float), FAN, air=frames.astype(float), mu_water=MU)
+        assert scan.info["signal_of_one_photon"] == pytest.approx(gain, rel=0.06)
+
+
 def test_the_logarithm_of_few_counts_is_not_biased():
     rng = np.random.default_rng(0)
     for mean in (0.5, 1.0, 2.0, 5.0, 30.0):
@@ -153,6 +164,40 @@ def test_sound_scans_are_not_accused(kind, air):
         scan = Scan.from_counts(n, g, air=np.broadcast_to(air * profile, g.shape[1:]))
     fixed, found = repair_defects(scan)
     assert (found, reading_warnings(fixed)) == ([], [])
+
+
+def without_lost(shone, share, prolonged, seed=0):
+    """Counts of a detector that loses a share of those in air to its dead time, of the variance
+    that leaves (binomial), over those in air."""
+    rate = share * shone  # times the dead time
+    kept, lack = (
+        (np.exp(-rate), 2.0 * rate * np.exp(-rate))
+        if prolonged
+        else (1.0 / (1.0 + rate), 1.0 - (1.0 + rate) ** -2)
+    )
+    in_air = math.exp(-share) if prolonged else 1.0 / (1.0 + share)
+    mean = 2e4 * shone * kept
+    counts = np.random.default_rng(seed).binomial(np.round(mean / lack).astype(int), lack)
+    return counts.astype(float), 2e4 * in_air
+
+
+@pytest.mark.parametrize("prolonged", [True, False])
+@pytest.mark.parametrize("share", [0.1, 0.15, 0.3])
+def test_counts_lost_to_a_dead_time_are_named_by_their_noise(share, prolonged):
+    counts, air = without_lost(SHONE, share, prolonged)
+    (found,) = warnings_of(counts, air=air)
+    assert "pile-up" in found
+    size = float(re.search(r"loses ([\d.]+) %", found).group(1))
+    assert size == pytest.approx(100.0 * share, abs=2.0 + 25.0 * share)
+    # The same counts by photons that are not spaced: another object's.
+    rng = np.random.default_rng(1)
+    assert warnings_of(rng.poisson(counts).astype(float), air=air) == []
+
+
+def test_filtered_readings_lack_noise_everywhere_and_are_no_pile_up():
+    n = counted(air=2e4)
+    for kept in (0.95, 0.8):  # the rest is read in the next view
+        assert warnings_of(kept * n + (1.0 - kept) * np.roll(n, 1, 0), air=2e4) == []
 
 
 def test_bridging_is_linear_and_knows_nothing_of_the_dead():

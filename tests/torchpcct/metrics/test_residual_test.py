@@ -84,7 +84,7 @@ def test_a_hundredth_of_a_column_is_no_finding_however_sure():
 def test_what_dense_rays_show_alone_is_beam_hardening_first():
     """Bone in some rows: said as a change of the gain once."""
     bone = torch.tensor([0.0, 0, 1, 1, 0, 0])[:, None] * (LINES > 0.06)
-    (text,) = residual_test(noise(2) / 10 + 0.03 * bone, 100 * W, LINES).findings[-1:]
+    (text,) = residual_test(noise(2) / 10**0.5 + 0.03 * bone, 10 * W, LINES).findings[-1:]
     assert "readings of some rows" in text
     assert text.index("beam hardening") < text.index("the gain changed")
     rows = torch.tensor([0.0, 0, 0.01, 0, 0, 0])[:, None].expand(SHAPE)
@@ -188,3 +188,41 @@ def test_a_single_row_that_fits_exactly():
     found = residual_test(r - r.mean(), w, torch.ones_like(r).cumsum(-1) / 100)
     assert found.findings == ()
     assert found.p_values["rows"] == 1.0
+
+
+def test_what_voxels_leave_in_whole_rows_and_views_is_no_gain():
+    """Faces between two slices: the fit spreads a part of what it cannot explain."""
+    disc = torch.zeros(SHAPE, dtype=torch.float64)
+    disc[:, 2:4, 6:18] = 0.3
+    face = torch.zeros(SHAPE, dtype=torch.float64)
+    face[:, [1, 2, 3, 4], 6:18] = 0.05
+    spread = torch.tensor([0.004, 0.0, -0.003, -0.003, 0.0, 0.004])[:, None]
+    clear = 400.0
+    found = residual_test(noise(7) / clear**0.5 + face + spread, clear * W, disc)
+    assert ["at edges" in text for text in found.findings] == [True]
+    # The same where the volume has no edges.
+    found = residual_test(noise(7) / clear**0.5 + spread, clear * W, torch.zeros_like(disc))
+    assert any("readings of some rows" in text for text in found.findings)
+
+
+def test_the_noise_of_few_frames_of_air_is_no_gain_of_rows_nor_of_the_whole():
+    """Nine frames of as many photons as a reading has."""
+    cells = torch.randn(SHAPE[1:], generator=torch.Generator().manual_seed(8)).double()
+    for frames, sound in ((9, True), (0.5, False)):
+        found = residual_test(noise(8) + cells / (frames * W.mean()) ** 0.5, W, LINES)
+        assert (found.findings == ()) == sound
+
+
+def test_gains_of_two_rows_are_told_from_a_face_between_them():
+    shape = (60, 2, 24)
+    weights, still = W[:, :2], noise(9)[:, :2] / 10
+    step = torch.zeros(shape, dtype=torch.float64)
+    step[:, 0, 6:18] = 0.3
+    wave = 0.05 * torch.sin(torch.linspace(0, 12.5, 60, dtype=torch.float64))[:, None]
+    face = torch.zeros(shape, dtype=torch.float64)
+    face[:, 0, 6:18] = wave
+    assert not any(
+        "some views" in t for t in residual_test(still + face, 100 * weights, step).findings
+    )
+    gains = residual_test(still + 0.2 * wave[:, None], 100 * weights, LINES[:, :2])
+    assert any("some views" in text for text in gains.findings)
