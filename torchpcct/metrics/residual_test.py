@@ -61,7 +61,8 @@ fit spreads over the other readings of whole views or rows, where nothing is wro
 and caps between two slices 2 % and up to 4 %; and what is added of it beyond :data:`COARSE`, where
 a finding says that voxels are too coarse."""
 _ROWS = 10
-"""Rows of which this part is so much; of fewer it is more."""
+"""Rows of which this part, and of rows :data:`GAIN_TOLERANCE`, are so much; of fewer they are
+more."""
 _DENSE = 0.8
 """Quantile of the line integrals from which on rays are dense: the densest fifth."""
 _DENSE_SHARE = 2.0
@@ -215,7 +216,8 @@ def residual_test(
         scores = total[known] / weight[known].sqrt()
         # Every view alone, and the slow drifts over all of them, which add up what single views
         # cannot tell.
-        tolerated = GAIN_TOLERANCE**2 * float(weight.sum()) + leaks
+        gain = GAIN_TOLERANCE * (rows if name == "rows" else 1.0)
+        tolerated = gain**2 * float(weight.sum()) + leaks
         tails = [_upper_tail(float(scores.square().sum()), scores.numel(), tolerated)]
         if parts == 2 and scores.numel() > 4 * _HARMONICS:
             tails.append(_upper_tail(*_drift(total, weight), tolerated))
