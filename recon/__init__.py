@@ -10,7 +10,7 @@ A geometry from the object itself: :mod:`recon.calibration`. What a method has t
 """
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torchpcct  # noqa: F401  (first: it settles how torch's threads wait)
 
@@ -32,7 +32,7 @@ _SOURCES = {
 }
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Public names load their module (torch, numba) when they are first used."""
     if name not in _SOURCES:
         raise AttributeError(f"module 'recon' has no attribute {name!r}")

@@ -18,12 +18,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from torchpcct.volume import from_hu, to_hu
+
+if TYPE_CHECKING:
+    from torchpcct.projector import Projector
+
 
 __all__ = ["NormalOperator", "Projected", "Quadratic"]
 
@@ -50,6 +54,14 @@ class NormalOperator(Protocol):
         ...
 
 
+class OperatorModel(Protocol):
+    """What a model of AᵀWA knows, see :class:`NormalOperator`."""
+
+    def periodic_spectrum(self) -> Tensor: ...
+
+    def information(self, mu_per_hu: float, frequency: float = ...) -> float: ...
+
+
 class Projected:
     """AᵀWA by one projection and one backprojection: exact.
 
@@ -60,7 +72,9 @@ class Projected:
             ``information``), and what may propose its steps.
     """
 
-    def __init__(self, projector: Any, weigh: Callable[[Tensor], Tensor], model: Any) -> None:
+    def __init__(
+        self, projector: Projector, weigh: Callable[[Tensor], Tensor], model: OperatorModel
+    ) -> None:
         self.projector, self.weigh, self.model = projector, weigh, model
 
     def apply(self, x: Tensor) -> Tensor:

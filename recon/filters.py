@@ -51,7 +51,7 @@ __all__ = [
     "tv",
 ]
 
-Image = TypeVar("Image", Tensor, NDArray[Any])
+Image = TypeVar("Image", Tensor, NDArray[np.generic])
 
 _REACH = 4.0
 """Standard deviations to which a Gaussian is summed."""
@@ -303,7 +303,7 @@ that."""
 
 
 @checked
-def denoised(name: str, volume: Image, flat: Any, **settings: Any) -> Image:
+def denoised(name: str, volume: Image, flat: object, **settings: Any) -> Image:
     """A volume filtered, with the noise measured in a region of it.
 
     Args:
@@ -323,7 +323,7 @@ def denoised(name: str, volume: Image, flat: Any, **settings: Any) -> Image:
 
 
 @checked
-def flat_noise(volume: Image, flat: Any, *, sigma: float = 0.0) -> float:
+def flat_noise(volume: Image, flat: object, *, sigma: float = 0.0) -> float:
     """Standard deviation in HU of a region that is flat in truth, of the volume smoothed by
     ``sigma`` voxels.
 
@@ -355,7 +355,7 @@ def flat_noise(volume: Image, flat: Any, *, sigma: float = 0.0) -> float:
     return found
 
 
-def denoiser_of(function: Callable[..., Any]) -> Callable[[Tensor, Callable[[], float]], Any]:
+def denoiser_of(function: Callable[..., object]) -> Callable[[Tensor, Callable[[], float]], object]:
     """A user's denoiser in the form ``(volume, noise)``: ``noise()`` gives the noise in HU, where
     it is asked for.
 
@@ -375,7 +375,7 @@ def denoiser_of(function: Callable[..., Any]) -> Callable[[Tensor, Callable[[], 
     return lambda volume, noise: function(volume)
 
 
-def places_of(function: Callable[..., Any]) -> list[inspect.Parameter]:
+def places_of(function: Callable[..., object]) -> list[inspect.Parameter]:
     """Arguments of a function, or of a module's ``forward``, that may be given by place."""
     try:
         signature = inspect.signature(
@@ -390,7 +390,7 @@ def places_of(function: Callable[..., Any]) -> list[inspect.Parameter]:
 @checked
 def deepinv_denoiser(
     model: Callable[..., Any], *, unit_hu: float = 1000.0, slices: bool = False
-) -> Any:
+) -> Callable[[Tensor, float], Tensor]:
     """A denoiser of deepinv (``model(x, sigma)`` of images with batch and channel) as
     :func:`denoiser_of` takes it.
 
@@ -450,7 +450,7 @@ def _noise(noise_hu: float) -> float:
     return number("noise_hu", noise_hu, positive=True, unit="HU")
 
 
-def _array(u: Tensor) -> NDArray[Any]:
+def _array(u: Tensor) -> NDArray[np.generic]:
     return np.ascontiguousarray(u.cpu().numpy())
 
 
@@ -471,7 +471,7 @@ def _smoothed(u: Tensor, sigma: float) -> Tensor:
     return torch.from_numpy(found).to(u.device)
 
 
-def _spectrum(covariance: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _spectrum(covariance: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Power spectrum of noise of variance 1 on a volume of a shape, as ``bm4d`` counts it: its
     sum is voxels²."""
     cov = np.asarray(covariance, dtype=np.float64)

@@ -74,7 +74,9 @@ def split_method(spec: Any) -> tuple[str, dict[str, Any]]:
     if name == "pwls":
         raise ValueError(f"pwls has no options, got {spec!r}")
     texts = mbir_options(rest)
-    options: dict[str, Any] = {k: texts[k] for k in ("weights", "network", "prior") if k in texts}
+    options: dict[str, object] = {
+        k: texts[k] for k in ("weights", "network", "prior") if k in texts
+    }
     if "fidelity" in texts:
         options["fidelity"] = float(texts["fidelity"])
     options |= {k: True for k in ("vessel", "tissues") if k in texts}
@@ -138,7 +140,7 @@ def is_module_name(text: str) -> bool:
     )
 
 
-def loaded(spec: str) -> Callable[..., Any]:
+def loaded(spec: str) -> Callable[..., object]:
     """The function or class that ``package.module:name`` names; its module is imported.
 
     Raises:
@@ -161,7 +163,7 @@ def loaded(spec: str) -> Callable[..., Any]:
         ) from error
     if not callable(found):
         raise TypeError(f"{spec} is no function")
-    function: Callable[..., Any] = found
+    function: Callable[..., object] = found
     return function
 
 

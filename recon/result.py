@@ -38,7 +38,7 @@ class Result(NamedTuple):
     tests: Sequence[ResidualTest] = ()
 
 
-def tested(name: str, said: list[str], test: Callable[..., T], *args: Any) -> list[T]:
+def tested(name: str, said: list[str], test: Callable[..., T], *args: object) -> list[T]:
     """What a test of a finished volume finds. A test that fails must not lose the volume: it
     becomes a warning.
 

@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 import torch
@@ -63,6 +63,13 @@ from torchpcct.scan_file import NoSlicesError
 from torchpcct.scan_grid import finite_cells, grid_of
 from torchpcct.validate import checked, choice, memory_bytes
 from torchpcct.volume import from_hu, to_hu
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from concurrent.futures import Executor
+
+    from torchpcct.typing import Array
+
 
 __all__ = ["ScanSlices", "SlabPlan", "StackOptions", "plan_slabs", "reconstruct_to"]
 
@@ -164,7 +171,7 @@ class ScanSlices:
         lead = () if g.has_rows else (self.count,)
         self.counts = torch.empty((*lead, *self.geometry.shape), device="meta")
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """For another process, which reads slabs: the file by its full path, no readings."""
         source = Path(self.source).resolve()  # type: ignore[arg-type]
         return {**self.__dict__, "source": source, "first": None, "counts": None}
@@ -176,7 +183,10 @@ class ScanSlices:
         return open_scan(self.source, slices=part, **self.options)
 
     def seen_grid(
-        self, voxel: float | None = None, extent: Any = None, center: Any = None
+        self,
+        voxel: float | None = None,
+        extent: float | Sequence[float] | None = None,
+        center: float | Sequence[float] | None = None,
     ) -> VolumeGrid:
         """What :meth:`torchpcct.VolumeGrid.of` gives."""
         return grid_of(self, voxel, extent, center)
@@ -554,7 +564,7 @@ def reconstruct_to(
     found: dict[str, float] = {}  # in the order of their appearance
     low, high, total = math.inf, -math.inf, 0.0
 
-    def keep(stop: int, values: Any, texts: dict[str, float]) -> None:
+    def keep(stop: int, values: NDArray[np.float32], texts: dict[str, float]) -> None:
         nonlocal low, high, total
         found.update(texts)
         low, high = min(low, float(values.min())), max(high, float(values.max()))
@@ -635,7 +645,12 @@ class _Maker:
 
 
 def _as_jobs(
-    executor: Any, maker: _Maker, plan: SlabPlan, key: str, folder: Path, keep: Callable[..., None]
+    executor: Executor,
+    maker: _Maker,
+    plan: SlabPlan,
+    key: str,
+    folder: Path,
+    keep: Callable[..., None],
 ) -> None:
     """Let workers make the slabs as pieces in ``folder``; each is kept when its turn has come."""
     packed, plane = pickle.dumps(maker), math.prod(maker.grid.shape[1:])
@@ -679,8 +694,8 @@ def _unpacked(packed: bytes) -> _Maker:
     return maker
 
 
-def _slab_piece(folder: Path, maker: _Maker, key: str, first: int, stop: int) -> dict[str, Any]:
-    def compute() -> dict[str, Any]:
+def _slab_piece(folder: Path, maker: _Maker, key: str, first: int, stop: int) -> dict[str, Array]:
+    def compute() -> dict[str, Array]:
         values, texts = maker(first, stop)
         return {
             "values": values,

@@ -8,7 +8,7 @@ Read in the order of the data: :mod:`~torchpcct.geometry` (axes, angles, grids),
 """
 
 import os
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 # The threads of the kernels (threads.py) and of torch take turns. By default an idle OpenMP thread
 # spins and steals the core from the others: several times slower. OpenMP reads it when torch loads,
@@ -86,7 +86,7 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *_LAZY})
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     # Kernels compile and torch loads on first use: ``import torchpcct`` stays quick.
     if name in _LAZY:
         import importlib

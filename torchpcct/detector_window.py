@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,6 +15,10 @@ from torch import Tensor
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, beam
 from torchpcct.validate import checked, whole
 from torchpcct.vector_geometry import VectorGeometry, check_motion
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Views
+
 
 __all__ = ["DetectorWindow", "footprint"]
 
@@ -40,7 +44,7 @@ class DetectorWindow:
         first_row, rows: the rows kept, the same in all views (2-D geometries: 0 and 1).
     """
 
-    first_column: Any
+    first_column: NDArray[np.int64]
     columns: int
     first_row: int = 0
     rows: int = 1
@@ -171,7 +175,7 @@ class DetectorWindow:
         """The same columns of other rows."""
         return DetectorWindow(self.first_column, self.columns, first_row, rows)
 
-    def select(self, views: Any) -> DetectorWindow:
+    def select(self, views: Views) -> DetectorWindow:
         """The same window for a subset (or reordering) of the views: an index array, mask or
         slice."""
         return DetectorWindow(self.first_column[views], self.columns, self.first_row, self.rows)
@@ -190,7 +194,7 @@ class DetectorWindow:
 
 @checked
 def footprint(
-    geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: Any = None
+    geometry: Geometry, grid: VolumeGrid, margin: int = 0, motion: object = None
 ) -> DetectorWindow:
     """The smallest window that sees every voxel corner of ``grid`` in every view.
 

@@ -23,9 +23,16 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torchpcct.formats.hdf5 import require_inside
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+    import h5py
+    from typing_extensions import Buffer
+
 
 __all__ = ["WriteError"]
 
@@ -232,7 +239,7 @@ class _Unfailing(io.FileIO):
 
     failure: BaseException | None = None
 
-    def write(self, data: Any, /) -> int:
+    def write(self, data: Buffer, /) -> int:
         rest = memoryview(data).cast("B")
         size = len(rest)
         try:
@@ -262,7 +269,7 @@ def _signals_wait() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield  # Python serves signals in the main thread only
         return
-    came: list[tuple[int, Any]] = []
+    came: list[tuple[int, FrameType | None]] = []
     found = {int(n): signal.getsignal(n) for n in signal.valid_signals()}
     handlers = {
         n: handler
@@ -281,7 +288,7 @@ def _signals_wait() -> Iterator[None]:
 
 
 @contextmanager
-def write_hdf5(path: str | os.PathLike[str], kind: str) -> Iterator[Any]:
+def write_hdf5(path: str | os.PathLike[str], kind: str) -> Iterator[h5py.File]:
     """Yield a new HDF5 file of the format ``torchpcct-KIND``, written whole or not at all and
     sealed.
 
@@ -375,7 +382,7 @@ def _check_seal(path: str | os.PathLike[str], kind: str) -> None:
 
 
 @contextmanager
-def read_hdf5(path: str | os.PathLike[str], kind: str) -> Iterator[Any]:
+def read_hdf5(path: str | os.PathLike[str], kind: str) -> Iterator[h5py.File]:
     """Open an HDF5 file whose attribute ``format`` is ``torchpcct-KIND``, for a block that reads
     it.
 

@@ -19,12 +19,16 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.validate import checked, choice, number, per_axis, whole
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Views
+
 
 __all__ = ["Beam", "ConeBeam", "FanBeam", "Geometry", "ParallelBeam", "VolumeGrid", "full_turn"]
 
@@ -44,7 +48,7 @@ def full_turn(views: int, start: float = 0.0) -> Floats:
     return np.arange(whole("views", views), dtype=np.float64) * (2.0 * math.pi / views) + start
 
 
-def _angles(value: Any) -> Floats:
+def _angles(value: object) -> Floats:
     try:
         given = np.asarray(value)
         # numpy would drop an imaginary part, and take None for NaN
@@ -208,12 +212,12 @@ class Geometry:
         their places; without rows a beam is that of every slice, and stays."""
         return self
 
-    def select(self: G, views: Any) -> G:
+    def select(self: G, views: Views) -> G:
         """The same scanner with a subset (or reordering) of the views: an index array, mask or
         slice."""
         return replace(self, angles=self.angles[views])  # type: ignore[type-var]
 
-    def _key(self) -> tuple[Any, ...]:
+    def _key(self) -> tuple[object, ...]:
         values = (getattr(self, f.name) for f in fields(self))  # type: ignore[arg-type]
         return (type(self), *(v.tobytes() if isinstance(v, np.ndarray) else v for v in values))
 
@@ -550,7 +554,7 @@ class VolumeGrid:
     @classmethod
     @checked
     def of(
-        cls, scan: Any, *, voxel: float | None = None, extent: Any = None, center: Any = None
+        cls, scan: Any, *, voxel: float | None = None, extent: object = None, center: object = None
     ) -> VolumeGrid:
         """The grid of what a scan sees.
 

@@ -18,9 +18,14 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torchpcct.cache_folder import private_folder
+
+if TYPE_CHECKING:
+    from numba.core.caching import Cache
+    from numba.core.event import Event
+
 
 OURS = ("torchpcct.", "recon.", "train.")
 """What the names of our modules begin with."""
@@ -104,7 +109,7 @@ def announce_compilation() -> None:
     class Announce(event.Listener):
         announced = False
 
-        def on_start(self, event: Any) -> None:
+        def on_start(self, event: Event) -> None:
             function = getattr(event.data.get("dispatcher"), "py_func", None)
             if not self.announced and getattr(function, "__module__", "").startswith(OURS):
                 Announce.announced = True
@@ -113,7 +118,7 @@ def announce_compilation() -> None:
                     "later ones read them from numba's cache"
                 )
 
-        def on_end(self, event: Any) -> None:
+        def on_end(self, event: Event) -> None:
             pass
 
     event.register("numba:compile", Announce())
@@ -138,11 +143,11 @@ def compiled_once(patience_s: float = 60.0) -> Iterator[None]:
     held: dict[str, BaseFileLock] = {}
     load, save, left = caching.Cache.load_overload, caching.Cache.save_overload, patience_s
 
-    def name_of(kernel: Any) -> str:
+    def name_of(kernel: Cache) -> str:
         where = f"{platform.node()} {kernel.cache_path} {kernel._impl.filename_base}"
         return hashlib.sha256(where.encode()).hexdigest()[:32]
 
-    def loaded(kernel: Any, *given: Any) -> Any:
+    def loaded(kernel: Cache, *given: object) -> object:
         nonlocal left
         found, name = load(kernel, *given), name_of(kernel)
         folder = None if found is not None or name in held else private_folder("locks")
@@ -162,7 +167,7 @@ def compiled_once(patience_s: float = 60.0) -> Iterator[None]:
             lock.release()
         return found
 
-    def saved(kernel: Any, *given: Any) -> None:
+    def saved(kernel: Cache, *given: object) -> None:
         try:
             save(kernel, *given)
         finally:
@@ -176,10 +181,10 @@ def compiled_once(patience_s: float = 60.0) -> Iterator[None]:
     class Ended(event.Listener):  # also a compilation that fails, and saves nothing
         depth = 0
 
-        def on_start(self, event: Any) -> None:
+        def on_start(self, event: Event) -> None:
             self.depth += 1
 
-        def on_end(self, event: Any) -> None:
+        def on_end(self, event: Event) -> None:
             self.depth -= 1
             if self.depth == 0:
                 release_all()

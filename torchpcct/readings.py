@@ -59,7 +59,7 @@ MOST_DEAD = 0.25
 """Largest share of a view's readings that may be dead: beyond it the neighbours say too little."""
 
 
-def _tensor(name: str, values: Any) -> Tensor:
+def _tensor(name: str, values: object) -> Tensor:
     """Float32 tensor of numbers in any array.
 
     Raises:
@@ -77,7 +77,7 @@ def _tensor(name: str, values: Any) -> Tensor:
     return torch.from_numpy(np.array(array, dtype=np.float32, order="C"))
 
 
-def _frame(name: str, values: Any, cells: tuple[int, ...]) -> tuple[Tensor, Tensor | None]:
+def _frame(name: str, values: object, cells: tuple[int, ...]) -> tuple[Tensor, Tensor | None]:
     """Mean over frames ``cells``, and the frames ``(frames, *cells)`` if there are several."""
     given = _tensor(name, values)
     if given.ndim <= len(cells) and tuple(given.shape) == cells[len(cells) - given.ndim :]:
@@ -103,7 +103,7 @@ def _shapes(name: str, readings: Tensor, geometry: Geometry) -> tuple[int, ...]:
 
 
 def _correction(
-    linearisation: Any, geometry: Geometry, mu_water: float | None
+    linearisation: object, geometry: Geometry, mu_water: float | None
 ) -> tuple[WaterLinearisation, str]:
     """The map of line integrals, and the unit of volumes."""
     columns = geometry.columns
@@ -133,7 +133,7 @@ def _views(cells: Tensor, geometry: Geometry) -> Tensor:
     return cells.unsqueeze(-len(geometry.shape))
 
 
-def _dead(mask: Any, readings: Tensor, air: Tensor, geometry: Geometry) -> Tensor:
+def _dead(mask: object, readings: Tensor, air: Tensor, geometry: Geometry) -> Tensor:
     """Dead readings, ``readings.shape`` or the shape of one frame with an axis of views of
     length 1."""
     cells = tuple(air.shape)
@@ -196,8 +196,13 @@ def _gain_of_noise(signal: Tensor, air: Tensor, geometry: Geometry) -> float:
 
 
 def _gain(
-    given: Any, signal: Tensor, air: Tensor, frames: Tensor | None, dark: Tensor, geometry: Geometry
-) -> Any:
+    given: object,
+    signal: Tensor,
+    air: Tensor,
+    frames: Tensor | None,
+    dark: Tensor,
+    geometry: Geometry,
+) -> tuple[float, str]:
     """Signal of one photon, and where it is from; see ``Scan.from_counts``."""
     if given is None and (frames is None or len(frames) < TRANSFER_FRAMES):
         level = float(air.nanmedian())
@@ -217,15 +222,15 @@ def _gain(
 
 
 def counted(
-    readings: Any,
+    readings: object,
     geometry: Geometry,
-    air: Any,
-    dark: Any,
-    gain: Any,
-    flux: Any,
-    dead: Any,
+    air: object,
+    dark: object,
+    gain: object,
+    flux: object,
+    dead: object,
     electronic_noise: float | None,
-    linearisation: Any,
+    linearisation: object,
     mu_water: float | None,
 ) -> dict[str, Any]:
     """Fields of a scan from raw readings; see ``Scan.from_counts``."""
@@ -274,7 +279,7 @@ def counted(
     return fields
 
 
-def _flux(flux: Any, geometry: Geometry) -> Tensor:
+def _flux(flux: object, geometry: Geometry) -> Tensor:
     given = _tensor("flux", flux)
     if tuple(given.shape) != (geometry.views,):
         raise ValueError(
@@ -288,11 +293,11 @@ def _flux(flux: Any, geometry: Geometry) -> Tensor:
 
 
 def logged(
-    lines: Any,
+    lines: object,
     geometry: Geometry,
-    photons: Any,
-    dead: Any,
-    linearisation: Any,
+    photons: object,
+    dead: object,
+    linearisation: object,
     mu_water: float | None,
 ) -> dict[str, Any]:
     """Fields of a scan from line integrals; see ``Scan.from_line_integrals``."""

@@ -34,6 +34,7 @@ from torchpcct.validate import UNITS, checked, choice, number, whole
 
 if TYPE_CHECKING:
     from torchpcct.scanner.scanner import Scanner
+    from torchpcct.typing import Ints, Views
 
 __all__ = ["Scan"]
 
@@ -113,19 +114,19 @@ class Scan:
     @checked
     def from_counts(
         cls,
-        readings: Any,
+        readings: object,
         geometry: Geometry,
         *,
-        air: Any,
-        dark: Any = 0.0,
+        air: object,
+        dark: object = 0.0,
         gain: float | str | None = None,
-        flux: Any = None,
-        dead: Any = None,
+        flux: object = None,
+        dead: object = None,
         electronic_noise: float | None = None,
-        linearisation: Any = None,
+        linearisation: object = None,
         mu_water: float | None = None,
         exposure_s: float = 1.0,
-        info: Mapping[str, Any] | None = None,
+        info: Mapping[str, object] | None = None,
     ) -> Scan:
         """A scan from the readings of any detector.
 
@@ -180,15 +181,15 @@ class Scan:
     @checked
     def from_line_integrals(
         cls,
-        lines: Any,
+        lines: object,
         geometry: Geometry,
         *,
-        photons: Any = None,
-        dead: Any = None,
-        linearisation: Any = None,
+        photons: object = None,
+        dead: object = None,
+        linearisation: object = None,
         mu_water: float | None = None,
         exposure_s: float = 1.0,
-        info: Mapping[str, Any] | None = None,
+        info: Mapping[str, object] | None = None,
     ) -> Scan:
         """A scan from line integrals −ln(transmission) that another software made.
 
@@ -339,7 +340,7 @@ class Scan:
             info={**self.info, "lower_dose": note},
         )
 
-    def weighted(self, weights: Any, scanner: Scanner | None = None) -> Scan:
+    def weighted(self, weights: object, scanner: Scanner | None = None) -> Scan:
         """The energy bins summed with weights: one channel, which shows a contrast better than the
         plain sum (:func:`torchpcct.spectral.bin_weights`).
 
@@ -413,12 +414,12 @@ class Scan:
         return {name: None if values is None else change(values) for name, values in held.items()}
 
     def seen_grid(
-        self, voxel: float | None = None, extent: Any = None, center: Any = None
+        self, voxel: float | None = None, extent: object = None, center: object = None
     ) -> VolumeGrid:
         """What :meth:`torchpcct.VolumeGrid.of` gives."""
         return grid_of(self, voxel, extent, center)
 
-    def select(self, views: Any) -> Scan:
+    def select(self, views: Views) -> Scan:
         """The same scan with a subset (or reordering) of the views: an index array, mask or
         slice."""
         at = views if isinstance(views, slice) else torch.as_tensor(views)
@@ -465,7 +466,7 @@ class Scan:
             else variance
         )
 
-    def _first_index(self) -> Any:
+    def _first_index(self) -> Ints:
         """Global index of the first reading of every detector row held in ``counts``."""
         g, w = self.geometry, self.window or DetectorWindow.full(self.geometry)
         if not (g.on_circle and g.has_rows):  # all of the detector, cells in the order in memory

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 
@@ -13,6 +13,10 @@ from torchpcct.files import VERSION, write_hdf5
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.vector_geometry import VectorGeometry
+
+if TYPE_CHECKING:
+    import h5py
+
 
 G = TypeVar("G", bound=Geometry)
 
@@ -82,7 +86,7 @@ def write_scan(scan: Any, path: str | os.PathLike[str]) -> None:
 
 
 def scan_fields(
-    file: Any, path: str | os.PathLike[str], slices: slice | None = None
+    file: h5py.File, path: str | os.PathLike[str], slices: slice | None = None
 ) -> dict[str, Any]:
     """Fields of the scan in an open HDF5 file; with ``slices`` those of some slices, or rows of a
     cone beam.
@@ -155,7 +159,9 @@ def scan_fields(
     }
 
 
-def slice_axis(geometry: Geometry, shape: tuple[int, ...], window: Any = None) -> int:
+def slice_axis(
+    geometry: Geometry, shape: tuple[int, ...], window: DetectorWindow | None = None
+) -> int:
     """Axis of the slices of a stack, or of the rows of a cone beam, in counts of a shape.
 
     Raises:
@@ -181,7 +187,7 @@ def sliced(geometry: G, slices: slice, count: int) -> tuple[G, list[int]]:
     return geometry.with_rows(first, stop - first), [first, stop, count]
 
 
-def write_geometry(group: Any, geometry: Geometry) -> None:
+def write_geometry(group: h5py.Group, geometry: Geometry) -> None:
     """Write a geometry into an HDF5 group (mm, rad)."""
     g: Any = geometry
     group.attrs.update(kind=type(g).__name__, columns=g.columns)
@@ -199,7 +205,7 @@ def write_geometry(group: Any, geometry: Geometry) -> None:
         group.attrs["rows"] = g.rows
 
 
-def read_geometry(group: Any) -> Geometry:
+def read_geometry(group: h5py.Group) -> Geometry:
     """Read what :func:`write_geometry` wrote; a group without a kind holds a cone beam.
 
     Raises:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,10 @@ from torchpcct.detector_window import NOISE_MARGIN_COLUMNS, DetectorWindow, foot
 from torchpcct.geometry import Beam, ConeBeam, Geometry, VolumeGrid
 from torchpcct.validate import number, numbers
 from torchpcct.vector_geometry import VectorGeometry
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
 
 Floats = NDArray[np.float64]
 
@@ -26,7 +30,9 @@ _SHARES = 40
 """Sizes that are tried, the largest first."""
 
 
-def grid_of(scan: Any, voxel: Any = None, extent: Any = None, center: Any = None) -> VolumeGrid:
+def grid_of(
+    scan: Any, voxel: object = None, extent: object = None, center: object = None
+) -> VolumeGrid:
     """See :meth:`torchpcct.VolumeGrid.of`, whose arguments these are."""
     voxel = None if voxel is None else number("voxel", voxel, positive=True, unit="mm")
     extent, center = _of_axes(scan, extent, center)
@@ -56,13 +62,15 @@ def grid_of(scan: Any, voxel: Any = None, extent: Any = None, center: Any = None
     )
 
 
-def _voxels(extent: Any, voxel: Any) -> tuple[int, ...]:
+def _voxels(extent: Sequence[float], voxel: float | Sequence[float]) -> tuple[int, ...]:
     """As many voxels an axis as cover an extent."""
     per_axis = np.broadcast_to(voxel, len(extent))
     return tuple(max(1, math.ceil(e / v - _SLACK)) for e, v in zip(extent, per_axis, strict=True))
 
 
-def _of_axes(scan: Any, extent: Any, center: Any) -> tuple[list[float] | None, list[Any] | None]:
+def _of_axes(
+    scan: Any, extent: object, center: object
+) -> tuple[list[float] | None, Sequence[float | None] | None]:
     """Extent and centre as z, y, x, where they are given; of slices the extent along z is 0.
 
     Raises:
@@ -115,7 +123,12 @@ def finite_cells(geometry: Geometry) -> list[float]:
 # --- a part of the detector -----------------------------------------------------------------------
 
 
-def _of_region(scan: Any, voxel: float | None, extent: Any, center: Any) -> VolumeGrid:
+def _of_region(
+    scan: Any,
+    voxel: float | None,
+    extent: Sequence[float] | None,
+    center: Any,
+) -> VolumeGrid:
     """The region; with another voxel size or extent, or from one voxel (an extent alone), a grid
     about it."""
     region = scan.region

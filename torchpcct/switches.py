@@ -14,25 +14,29 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import wraps
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
 
 _ERRORS = {"divide": "warn", "over": "warn", "under": "ignore", "invalid": "warn"}
 """As numpy has them."""
 _NOTHING = nullcontext()
 
-F = TypeVar("F", bound=Callable[..., Any])
+F = TypeVar("F", bound=Callable[..., object])
 
 
-def unswitched() -> AbstractContextManager[Any]:
+def unswitched() -> AbstractContextManager[object]:
     """Within: numpy's errors as numpy has them, float32 and the CPU as torch's defaults, no
     autocast.
 
     Where nothing is switched, which costs a microsecond to find out, nothing is done. The default
     dtype is that of all threads of the process while the call runs.
     """
-    torch: Any = sys.modules.get("torch")  # what does not need it does not load it
+    torch: ModuleType | None = sys.modules.get("torch")  # what does not need it does not load it
     numpy_as_ever = np.geterr() == _ERRORS
     if torch is None or not hasattr(torch, "compiler") or torch.compiler.is_compiling():
         return _NOTHING if numpy_as_ever else np.errstate(**_ERRORS)  # type: ignore[arg-type]
@@ -46,7 +50,7 @@ def unswitched() -> AbstractContextManager[Any]:
 
 
 @contextmanager
-def _all(torch: Any) -> Iterator[None]:
+def _all(torch: ModuleType) -> Iterator[None]:
     dtype = torch.get_default_dtype()
     with ExitStack() as stack:
         stack.enter_context(np.errstate(**_ERRORS))  # type: ignore[arg-type]
@@ -64,7 +68,7 @@ def undisturbed(function: F) -> F:
     """A function that runs :func:`unswitched`."""
 
     @wraps(function)
-    def call(*args: Any, **kwargs: Any) -> Any:
+    def call(*args: object, **kwargs: object) -> object:
         with unswitched():
             return function(*args, **kwargs)
 

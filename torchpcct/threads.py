@@ -12,7 +12,11 @@ import os
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
 
 __all__ = ["get_num_threads", "set_num_threads"]
 
@@ -55,7 +59,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_renew)
 
 
-def _helped(work: Any, number: int) -> list[Future[None]]:
+def _helped(work: Callable[[], None], number: int) -> list[Future[None]]:
     """``work`` on so many other threads, as soon as one is free."""
     global _helpers
     if _helpers is None:
@@ -67,7 +71,7 @@ def _helped(work: Any, number: int) -> list[Future[None]]:
         return []
 
 
-def run(kernel: Any, count: int, *args: Any, operations: int = _LEAST) -> None:
+def run(kernel: Callable[..., None], count: int, *args: object, operations: int = _LEAST) -> None:
     """``kernel(begin, end, *args)`` on pieces of 0 … count, at once on several threads.
 
     Args:

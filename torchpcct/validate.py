@@ -8,19 +8,35 @@ import inspect
 import math
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, TypedDict, TypeVar, Unpack, cast
 
 import numpy as np
 
 from torchpcct.switches import unswitched
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from torchpcct.typing import Floats
+
+
 UNITS = ("HU", "mm^-1", "pixel^-1")
 """Of scans and volumes; of ``pixel^-1`` all lengths are in pixels."""
 
 
+class Limits(TypedDict, total=False):
+    """What :func:`number` holds a value to."""
+
+    positive: bool
+    finite: bool
+    low: float | None
+    high: float | None
+    unit: str
+
+
 def number(
     name: str,
-    value: Any,
+    value: object,
     *,
     positive: bool = False,
     finite: bool = True,
@@ -46,7 +62,7 @@ def number(
     if isinstance(value, complex):
         raise TypeError(f"{name} must be a real number{unit and ' in' + unit}, got {value!r}")
     try:
-        result = float(value)
+        result = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
         raise TypeError(
             f"{name} must be a number{unit and ' in' + unit}, got {value!r} "
@@ -65,7 +81,7 @@ def number(
     return result
 
 
-def coverage(name: str, value: Any) -> float:
+def coverage(name: str, value: object) -> float:
     """``value`` as the coverage of an interval: a number between 0 and 1, ends excluded.
 
     Raises:
@@ -78,7 +94,9 @@ def coverage(name: str, value: Any) -> float:
     return share
 
 
-def numbers(name: str, value: Any, count: int | None = None, **limits: Any) -> tuple[float, ...]:
+def numbers(
+    name: str, value: object, count: int | None = None, **limits: Unpack[Limits]
+) -> tuple[float, ...]:
     """``value`` as a tuple of floats, each checked by :func:`number`.
 
     Args:
@@ -99,7 +117,7 @@ def numbers(name: str, value: Any, count: int | None = None, **limits: Any) -> t
     return tuple(number(f"{name}[{i}]", v, **limits) for i, v in enumerate(value))
 
 
-def per_axis(name: str, value: Any, axes: int, **limits: Any) -> tuple[float, ...]:
+def per_axis(name: str, value: object, axes: int, **limits: Unpack[Limits]) -> tuple[float, ...]:
     """One number for every axis: a single one is repeated, ``axes`` of them are taken as they are.
 
     Raises:
@@ -114,7 +132,7 @@ def per_axis(name: str, value: Any, axes: int, **limits: Any) -> tuple[float, ..
     return (number(name, value, **limits),) * axes
 
 
-def whole(name: str, value: Any, low: int = 1, high: int | None = None) -> int:
+def whole(name: str, value: object, low: int = 1, high: int | None = None) -> int:
     """``value`` as an int of at least ``low`` and, if given, at most ``high``; ``True`` and ``3.0``
     are refused.
 
@@ -158,7 +176,7 @@ def memory_bytes(value: int | str) -> int:
     return found
 
 
-def choice(name: str, value: Any, options: Collection[str]) -> str:
+def choice(name: str, value: object, options: Collection[str]) -> str:
     """``value``, if it is one of the options.
 
     Raises:
@@ -171,7 +189,7 @@ def choice(name: str, value: Any, options: Collection[str]) -> str:
     return str(value)
 
 
-def meant(given: Any, options: Iterable[str]) -> str:
+def meant(given: object, options: Iterable[str]) -> str:
     """`` (did you mean 'pwls'?)`` where an option is like the text that was given, else nothing."""
     import difflib  # of refusals only
 
@@ -179,7 +197,7 @@ def meant(given: Any, options: Iterable[str]) -> str:
     return f" (did you mean {near[0]!r}?)" if near else ""
 
 
-def reals(name: str, value: Any) -> Any:
+def reals(name: str, value: object) -> Floats:
     """``value`` as an array of real numbers, float64, of any shape.
 
     Raises:
@@ -190,7 +208,7 @@ def reals(name: str, value: Any) -> Any:
     return np.asarray(value.detach() if hasattr(value, "detach") else value, dtype=np.float64)
 
 
-def broadcast(**arrays: Any) -> list[Any]:
+def broadcast(**arrays: Floats) -> list[Floats]:
     """Arrays by their names, broadcast to one shape.
 
     Raises:
@@ -203,7 +221,7 @@ def broadcast(**arrays: Any) -> list[Any]:
         raise ValueError(f"shapes must be equal or broadcast to one, got {listed}") from None
 
 
-def shaped(name: str, value: Any, wanted: tuple[int | None, ...]) -> None:
+def shaped(name: str, value: ArrayLike, wanted: tuple[int | None, ...]) -> None:
     """Refuse an array or tensor of another shape, before a compiled kernel that checks no index
     reads it.
 
@@ -225,9 +243,9 @@ def shaped(name: str, value: Any, wanted: tuple[int | None, ...]) -> None:
         )
 
 
-F = TypeVar("F", bound=Callable[..., Any])
+F = TypeVar("F", bound=Callable[..., object])
 
-_KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+_KINDS: dict[str, tuple[str, Callable[[object], bool]]] = {
     "int": ("a whole number", lambda v: isinstance(v, int | np.integer) and not _is_truth(v)),
     "float": (
         "a number",
@@ -243,6 +261,7 @@ _KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "bool": ("True or False", lambda v: _is_truth(v)),
     "None": ("None", lambda v: v is None),
     "Any": ("anything", lambda v: True),
+    "object": ("anything", lambda v: True),
     "ArrayLike": ("real numbers", lambda v: _is_real(v)),
     "Floats": ("real numbers", lambda v: _is_real(v)),
     "Callable": ("a function", callable),
@@ -282,7 +301,7 @@ def checked(function: F) -> F:
     }
 
     @functools.wraps(function)
-    def call(*args: Any, **kwargs: Any) -> Any:
+    def call(*args: object, **kwargs: object) -> object:
         try:
             given = signature.bind(*args, **kwargs).arguments
         except TypeError:
@@ -305,7 +324,7 @@ def checked(function: F) -> F:
     return cast(F, call)
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     """A value for a message: its kind and, where that is short, itself."""
     kind = type(value).__name__
     return kind if hasattr(value, "shape") or len(repr(value)) > 60 else f"{value!r} ({kind})"
@@ -326,7 +345,7 @@ def _in_words(kind: str) -> str:
     return _SAID.get(head, f"a {head.rpartition('.')[2]}")
 
 
-def _is(value: Any, kind: str, names: Mapping[str, Any]) -> bool:
+def _is(value: object, kind: str, names: Mapping[str, object]) -> bool:
     head, _, inner = kind.partition("[")
     if head in _KINDS:
         return _KINDS[head][1](value)
@@ -349,11 +368,11 @@ def _is(value: Any, kind: str, names: Mapping[str, Any]) -> bool:
     return not by_name or any(base.__name__ == head for base in type(value).__mro__)
 
 
-def _is_truth(value: Any) -> bool:
+def _is_truth(value: object) -> bool:
     return isinstance(value, bool | np.bool_)
 
 
-def _is_real(value: Any) -> bool:
+def _is_real(value: object) -> bool:
     if value is None or isinstance(value, str | bytes | Mapping):
         return False
     try:

@@ -12,13 +12,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, beam
 from torchpcct.validate import checked, number, whole
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from torchpcct.typing import Views
+
 
 __all__ = ["VectorGeometry", "helical_motion"]
 
@@ -42,7 +48,7 @@ class VectorGeometry(Geometry):
         TypeError: a value of the wrong kind.
     """
 
-    vectors: Any
+    vectors: Floats
     columns: int
     rows: int | None = None
     parallel: bool = False
@@ -110,7 +116,7 @@ class VectorGeometry(Geometry):
 
     @classmethod
     @checked
-    def of(cls, geometry: Geometry, motion: Any = None) -> VectorGeometry:
+    def of(cls, geometry: Geometry, motion: object = None) -> VectorGeometry:
         """A circular scan with a flat detector, view by view; its ``vectors`` are what ASTRA takes.
 
         Args:
@@ -277,7 +283,7 @@ class VectorGeometry(Geometry):
         up = (first + 0.5 * (rows - self.rows)) * poses[:, 3]
         return replace(self._with(1, poses[:, 1] + up), rows=rows)
 
-    def select(self, views: Any) -> VectorGeometry:
+    def select(self, views: Views) -> VectorGeometry:
         """The same scan with a subset (or reordering) of the views: an index array, mask or
         slice."""
         return replace(self, vectors=self.vectors[views])
@@ -288,7 +294,7 @@ class VectorGeometry(Geometry):
             2, -self.poses[:, 2] if columns else None, 3, -self.poses[:, 3] if rows else None
         )
 
-    def shifted(self, columns: Any = 0.0, rows: Any = 0.0) -> VectorGeometry:
+    def shifted(self, columns: ArrayLike = 0.0, rows: ArrayLike = 0.0) -> VectorGeometry:
         """The detector displaced in its own plane, by parts of a cell: ``centre + columns · u +
         rows · v``.
 
@@ -299,7 +305,9 @@ class VectorGeometry(Geometry):
         poses = self.poses
         return self._with(1, poses[:, 1] + c * poses[:, 2] + r * poses[:, 3])
 
-    def turned(self, roll: Any = 0.0, tilt: Any = 0.0, slant: Any = 0.0) -> VectorGeometry:
+    def turned(
+        self, roll: ArrayLike = 0.0, tilt: ArrayLike = 0.0, slant: ArrayLike = 0.0
+    ) -> VectorGeometry:
         """The detector turned about its own centre: first slant, then tilt, then roll.
 
         Args:
@@ -324,7 +332,7 @@ class VectorGeometry(Geometry):
         normal = np.cross(u, v)
         return self._with(2, _rotated(u, normal, roll), 3, _rotated(v, normal, roll))
 
-    def moved(self, motion: Any) -> VectorGeometry:
+    def moved(self, motion: object) -> VectorGeometry:
         """The scan as seen from a grid that is displaced by ``motion``, as for ``Projector``.
 
         Raises:
@@ -399,7 +407,7 @@ class VectorGeometry(Geometry):
             return None
         return found, None if np.abs(motion).max() <= 1e-9 * far else motion
 
-    def _with(self, *parts: Any) -> VectorGeometry:
+    def _with(self, *parts: int | Floats | None) -> VectorGeometry:
         """Other vectors: place, ``(views, 3)`` or None (unchanged), in turn."""
         poses = self.poses.copy()
         for place, value in zip(parts[::2], parts[1::2], strict=True):
@@ -410,7 +418,7 @@ class VectorGeometry(Geometry):
 
 
 @checked
-def check_motion(motion: Any, views: int, axes: int) -> Floats:
+def check_motion(motion: object, views: int, axes: int) -> Floats:
     """Displacements of the grid per view as ``(views, axes)`` float64.
 
     Raises:
@@ -427,14 +435,14 @@ def check_motion(motion: Any, views: int, axes: int) -> Floats:
     return shift
 
 
-def _numbers(motion: Any) -> Floats:
+def _numbers(motion: object) -> Floats:
     """A copy in float64, of a tensor, too."""
     plain = motion.detach().cpu().numpy() if hasattr(motion, "detach") else motion
     return np.array(plain, dtype=np.float64)
 
 
 @checked
-def split_motion(motion: Any, views: int, axes: int) -> tuple[Floats, Floats | None]:
+def split_motion(motion: object, views: int, axes: int) -> tuple[Floats, Floats | None]:
     """Displacements of the grid per view ``(views, axes)``, and rotations about z ``(views,)`` rad
     where a last column more has them.
 
@@ -475,7 +483,7 @@ def helical_motion(geometry: ConeBeam, feed: float, start: float = 0.0) -> Float
     return out
 
 
-def _per_view(name: str, value: Any, views: int) -> Floats:
+def _per_view(name: str, value: ArrayLike, views: int) -> Floats:
     """``(views, 1)`` of one number or one per view."""
     given = np.asarray(value, dtype=np.float64)
     if given.shape not in ((), (views,)) or not np.isfinite(given).all():

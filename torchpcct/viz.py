@@ -15,6 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+    from torch import Tensor
+
     from torchpcct.volume import Volume
 
 __all__ = ["Panel", "panels", "viewer_page"]
@@ -36,10 +39,10 @@ class Panel:
         caption: text below.
     """
 
-    image: Any
+    image: ArrayLike | Tensor
     extent: tuple[float, float, float, float]
     title: str = ""
-    outlines: Sequence[tuple[Any, str]] = field(default_factory=tuple)
+    outlines: Sequence[tuple[ArrayLike | Tensor, str]] = field(default_factory=tuple)
     caption: str = ""
 
 

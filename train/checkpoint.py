@@ -31,7 +31,7 @@ class CheckpointStore:
         self.current = folder / "checkpoint.safetensors"
         self.previous = folder / "checkpoint.previous.safetensors"
 
-    def save(self, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
+    def save(self, tensors: Mapping[str, Tensor], metadata: Mapping[str, object]) -> None:
         """Write the checkpoint; the one in place becomes the previous one."""
         fresh = self.current.with_name(UNFINISHED)
         write_tensors(fresh, CHECKPOINT_FORMAT, tensors, metadata)

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from importlib import resources
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import yaml
 
@@ -23,19 +23,28 @@ from torchpcct.formats.damage import yaml_values
 from torchpcct.validate import checked, number, numbers, whole
 from train.scenes.scene import SceneConfig
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+    from torchpcct.typing import Json
+
+
 __all__ = ["DataConfig", "ObjectiveConfig", "TrainConfig", "load_config"]
 
 LONGEST_INTERVAL = 120.0
 """Largest ``checkpoint_seconds``: what a killed run may lose, in s."""
 
 
-def _set(config: object, **values: Any) -> None:
+def _set(config: object, **values: object) -> None:
     """Put checked values into a frozen dataclass."""
     for name, value in values.items():
         object.__setattr__(config, name, value)
 
 
-def _section(cls: Any, values: Any, where: str) -> Any:
+C = TypeVar("C", bound="DataclassInstance")
+
+
+def _section(cls: type[C], values: object, where: str) -> C:
     """Dataclass ``cls`` from plain values; ``where`` is its name in messages."""
     if isinstance(values, cls):
         return values
@@ -329,9 +338,9 @@ class TrainConfig:
         config: Self = _section(cls, {} if values is None else values, "")
         return config
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Json]:
         """Plain values for JSON and YAML (tuples as lists)."""
-        plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        plain: dict[str, Json] = json.loads(json.dumps(asdict(self)))
         return plain
 
     def to_yaml(self) -> str:
@@ -362,7 +371,7 @@ def packaged_config(name: str) -> TrainConfig:
 
 
 @checked
-def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
+def differences(first: Mapping[str, object], second: Mapping[str, object]) -> list[str]:
     """Names in which two configurations, as plain values, differ, with a dot after the name of a
     section."""
     a, b = _flat(first), _flat(second)
@@ -370,8 +379,8 @@ def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str
     return sorted(key for key in a.keys() | b.keys() if a.get(key, missing) != b.get(key, missing))
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    out: dict[str, Any] = {}
+def _flat(values: Mapping[str, object], prefix: str = "") -> dict[str, object]:
+    out: dict[str, object] = {}
     for key, value in values.items():
         out.update(
             _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}

@@ -186,7 +186,7 @@ class Views:
             with atomic_write(self.folder / "config.json") as part:
                 part.write_text(key, encoding="utf-8")
 
-    def _open(self, name: str, shape: tuple[int, ...], kind: type) -> Any:
+    def _open(self, name: str, shape: tuple[int, ...], kind: type) -> np.memmap:
         path = self.folder / f"{name}.npy"
         if not path.exists():
             size = math.prod(shape) * np.dtype(kind).itemsize
@@ -411,7 +411,9 @@ def _compute_views(config: DataConfig, seed: int, folder: Path, numbers: Sequenc
         data.sample(number)
 
 
-def _paint(config: DataConfig, seed: int, numbers: Sequence[int]) -> list[list[NDArray[Any]]]:
+def _paint(
+    config: DataConfig, seed: int, numbers: Sequence[int]
+) -> list[list[NDArray[np.generic]]]:
     """Scenes for another process, which computes their views."""
     return [
         [v.numpy() for v in painted(config, seed_of("scene", seed, number))] for number in numbers

@@ -10,13 +10,18 @@ import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, TextIO
 
 from matplotlib.image import imsave
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from torchpcct.files import atomic_write
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
+
+    from torchpcct.typing import Reals
+
 
 logger = logging.getLogger(__name__)
 
@@ -43,7 +48,7 @@ class Table:
         self.path = path
         self.columns: list[str] = []
         self._rows: list[dict[str, str]] = []
-        self._file: Any = None
+        self._file: TextIO | None = None
         if path.exists():
             text = path.read_text(encoding="utf-8")
             # Without its line end the last row may be cut short anywhere, also within a number.
@@ -91,7 +96,7 @@ class Table:
             writer.writeheader()
             writer.writerows(self._rows)
 
-    def _writer(self, file: Any) -> csv.DictWriter[str]:
+    def _writer(self, file: TextIO) -> csv.DictWriter[str]:
         return csv.DictWriter(file, self.columns, lineterminator="\n")
 
 
@@ -164,7 +169,7 @@ class Logs:
         step: int,
         score: float,
         figures: Mapping[str, float],
-        pictures: Mapping[str, NDArray[Any]],
+        pictures: Mapping[str, Reals],
     ) -> None:
         """A validation is done."""
         values = {"score": score, **figures}
@@ -203,7 +208,7 @@ class Logs:
                 self._writer.add_scalar(f"{group}/{name}", value, step)
 
 
-def _writer(folder: Path, purge_step: int) -> Any:
+def _writer(folder: Path, purge_step: int) -> SummaryWriter | None:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:

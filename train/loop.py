@@ -17,7 +17,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from torch import nn
 
@@ -27,6 +27,9 @@ from train.logs import Logs
 from train.objective import Objective
 from train.processes import Group, gradient
 from train.run import Run, State
+
+if TYPE_CHECKING:
+    from types import FrameType
 
 
 def train(
@@ -126,12 +129,12 @@ def _signals(alone: bool) -> Iterator[list[int]]:
         yield caught
         return
 
-    def handle(number: int, _frame: Any) -> None:
+    def handle(number: int, _frame: FrameType | None) -> None:
         if caught and alone and number == signal.SIGINT:
             raise KeyboardInterrupt
         caught.append(number)
 
-    before: dict[int, Callable[..., Any] | int | None] = {}
+    before: dict[int, Callable[..., object] | int | None] = {}
     try:
         for which in (signal.SIGTERM, signal.SIGINT):
             before[which] = signal.signal(which, handle)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from torch import Tensor, distributed, nn
@@ -39,7 +38,7 @@ class Group:
 
     def gather(self, values: Mapping[str, float]) -> list[Mapping[str, float]]:
         """The figures of every process, in the order of ranks."""
-        out: list[Any] = [values] * self.size
+        out: list[Mapping[str, float]] = [values] * self.size
         if self.size > 1:
             distributed.all_gather_object(out, dict(values))
         return out

@@ -95,7 +95,7 @@ def _averaged(model: nn.Module, ema: float) -> AveragedModel:
     """Moving average of parameters and buffers; it starts at the weights of now."""
 
     @torch.no_grad()
-    def mix(averages: Any, fresh: Any, count: Tensor | int) -> None:
+    def mix(averages: list[Tensor], fresh: list[Tensor], count: Tensor | int) -> None:
         if not averages[0].is_floating_point():
             torch._foreach_copy_(averages, fresh)
             return
@@ -329,7 +329,7 @@ def _cpu() -> str:
     return (names or [platform.processor() or platform.machine()])[0]
 
 
-def finite(value: Any) -> Any:
+def finite(value: object) -> object:
     """JSON values with the numbers that JSON does not know ('nan', 'inf') as text."""
     if isinstance(value, Mapping):
         return {k: finite(v) for k, v in value.items()}

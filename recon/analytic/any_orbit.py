@@ -176,7 +176,7 @@ def _divergent(poses: Floats, rows: int, columns: int, cone: bool) -> IdealCircl
                 "Projector(geometry, grid))"
             )
         number, middle_row = _axis_of(float(w.min()), float(w.max()), row_pitch)
-        geometry: Any = ConeBeam(
+        geometry: ConeBeam | FanBeam = ConeBeam(
             beta, sod, sdd, count, number, (row_pitch, pitch), (middle_row, offset)
         )
         v = geometry.row_positions

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -28,6 +28,10 @@ from torchpcct.projector.rays import rays_of
 from torchpcct.threads import run
 from torchpcct.validate import checked
 from torchpcct.vector_geometry import check_motion
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Floats
+
 
 __all__ = ["backproject"]
 
@@ -71,7 +75,7 @@ def _atan_polynomial(reach: float, columns_per_rad: float, dtype: torch.dtype) -
 
 
 @checked
-def check_data(name: str, data: Any, shape: tuple[int, ...]) -> None:
+def check_data(name: str, data: object, shape: tuple[int, ...]) -> None:
     if not isinstance(data, Tensor):
         raise TypeError(
             f"{name} must be a torch.Tensor, got {type(data).__name__}: use torch.as_tensor"
@@ -107,7 +111,11 @@ class BackprojectionPlan:
     :func:`backproject`."""
 
     def __init__(
-        self, geometry: Geometry, grid: VolumeGrid, window: DetectorWindow, motion: Any = None
+        self,
+        geometry: Geometry,
+        grid: VolumeGrid,
+        window: DetectorWindow,
+        motion: Any = None,
     ) -> None:
         self.grid, self.window = grid, window
         self.geometry = geometry = beam(geometry)
@@ -213,9 +221,16 @@ class BackprojectionPlan:
                     "motion=motion)"
                 )
 
-    def _arguments(self, dtype: torch.dtype) -> list[Any]:
+    def _arguments(self, dtype: torch.dtype) -> list[object]:
         axes = self.grid.axes
-        common: list[Any] = [self.cosines, self.sines, self.shifts, self.starts, axes[-1], axes[-2]]
+        common: list[object] = [
+            self.cosines,
+            self.sines,
+            self.shifts,
+            self.starts,
+            axes[-1],
+            axes[-2],
+        ]
         if self.cone:
             common.append(axes[0])
         common += [self.sod, self.sdd, self.scale]
@@ -531,7 +546,7 @@ def _between(position: Tensor, cells: int) -> list[tuple[Tensor, Tensor]]:
     return [(left, 1.0 - share), ((left + 1).clamp_max(cells - 1), share)]
 
 
-def _shifts(motion: Any, cosines: Any, sines: Any, axes: int) -> NDArray[np.float64]:
+def _shifts(motion: Any, cosines: Floats, sines: Floats, axes: int) -> NDArray[np.float64]:
     """Displacement towards the source, along the columns and upwards, ``(views, 3)`` mm."""
     out = np.zeros((cosines.size, 3))
     if motion is None:
@@ -551,7 +566,7 @@ def backproject(
     grid: VolumeGrid,
     window: DetectorWindow | None = None,
     *,
-    motion: Any = None,
+    motion: object = None,
 ) -> Tensor:
     """Backproject filtered data with FBP's distance weights: the second half of filtered
     backprojection.

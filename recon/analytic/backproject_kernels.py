@@ -32,9 +32,17 @@ TILE = 32
 
 # No "nnan" or "ninf": NaN and Inf of the data must reach the image.
 _FAST = {"contract", "nsz", "arcp"}
-_OPTIONS: Any = {"nogil": True, "cache": True, "error_model": "numpy", "fastmath": _FAST}
+_OPTIONS: Any = {
+    "nogil": True,
+    "cache": True,
+    "error_model": "numpy",
+    "fastmath": _FAST,
+}
 _INLINE: Any = {"cache": True, "error_model": "numpy", "fastmath": _FAST}
-_BARE: Any = {**_INLINE, "_nrt": False}  # without reference counts: for what allocates nothing
+_BARE: Any = {
+    **_INLINE,
+    "_nrt": False,
+}  # without reference counts: for what allocates nothing
 
 
 @njit(**_INLINE)

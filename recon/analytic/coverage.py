@@ -5,7 +5,7 @@ without data it extrapolates, plausibly, and a wrong rotation centre it draws as
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +19,12 @@ from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid, beam, view_step
 from torchpcct.scan import Scan
 from torchpcct.validate import checked
 from torchpcct.vector_geometry import VectorGeometry
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from torchpcct.typing import Floats, Ints
+
 
 __all__ = ["consistency_warnings"]
 
@@ -61,7 +67,7 @@ travel."""
 
 
 @checked
-def refuse_helix(geometry: Geometry, motion: Any) -> None:
+def refuse_helix(geometry: Geometry, motion: object) -> None:
     """Raise ``ValueError`` for a motion that makes a cone beam's circle a helix, which FDK cannot
     reconstruct.
 
@@ -84,7 +90,7 @@ def refuse_helix(geometry: Geometry, motion: Any) -> None:
 
 
 @checked
-def check_rows(geometry: Geometry, grid: VolumeGrid, motion: Any = None) -> list[str]:
+def check_rows(geometry: Geometry, grid: VolumeGrid, motion: object = None) -> list[str]:
     """Refuse a grid that no view of a cone beam sees; say which slices are not seen by all views,
     or by none.
 
@@ -264,7 +270,7 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid) -> list[str]:
     return found
 
 
-def _unmeasured_texts(lines: Any, geometry: Any, grid: VolumeGrid) -> list[str]:
+def _unmeasured_texts(lines: Tensor, geometry: Any, grid: VolumeGrid) -> list[str]:
     """Lines through the object and the grid that no view measured, of a cone beam in the plane of
     the source: FBP refuses an arc below half a turn and the detector's fan, an iterative method
     takes it, and needs half a turn and the object's.
@@ -352,7 +358,7 @@ def _surround_texts(scan: Scan) -> list[str]:
     return found
 
 
-def _border_deviation(scan: Scan, part: slice) -> tuple[Any, Any]:
+def _border_deviation(scan: Scan, part: slice) -> tuple[Floats, Floats]:
     """Relative deviation of the columns ``part`` of a window from the surround in blocks of views,
     and its standard error from the scatter of the views: ratios of sums, which have no bias of a
     logarithm."""
@@ -374,7 +380,7 @@ def _border_deviation(scan: Scan, part: slice) -> tuple[Any, Any]:
     return np.array(ratios), np.array(errors)
 
 
-def _gain_spread(lines: Any, columns: Any) -> float:
+def _gain_spread(lines: Tensor, columns: Ints) -> float:
     """Standard deviation of the cells' gains, less 4 standard errors; 0 where there are too few
     rows.
 
@@ -406,7 +412,7 @@ def _gain_spread(lines: Any, columns: Any) -> float:
     return math.sqrt(max(mean - 4.0 * error, 0.0) / 1.5)
 
 
-def _cut_text(lines: Any, sides: tuple[bool, bool]) -> str:
+def _cut_text(lines: Tensor, sides: tuple[bool, bool]) -> str:
     ends = [
         lines[..., k].reshape(lines.shape[0], -1).mean(1)
         for k, cut in ((0, sides[0]), (-1, sides[1]))

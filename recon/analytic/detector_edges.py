@@ -195,7 +195,7 @@ def continued(rows: Rows, sides: tuple[bool, bool], outside: float) -> Rows:
     return Rows(torch.cat(parts, -1), wide, weights)
 
 
-def _cylinder(last: Tensor, near: Floats, far: Floats, mu: Any) -> Tensor:
+def _cylinder(last: Tensor, near: Floats, far: Floats, mu: float | Floats) -> Tensor:
     """Chords at ``far`` of the cylinder that fits the readings ``last (..., [rows,] fit)`` at
     ``near`` best.
 

@@ -9,7 +9,7 @@ import warnings
 import weakref
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar, cast
+from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
 import torch
@@ -39,7 +39,7 @@ G = TypeVar("G", bound=Geometry)
 
 
 def _check_weights(
-    weights: Any, geometry: Geometry, grid: VolumeGrid | None = None
+    weights: object, geometry: Geometry, grid: VolumeGrid | None = None
 ) -> NDArray[np.float64]:
     if weights is None:
         return angular_weights(geometry, grid)
@@ -62,7 +62,7 @@ def filter_sinogram(
     window: DetectorWindow | None = None,
     *,
     held: DetectorWindow | None = None,
-    weights: Any = None,
+    weights: object = None,
 ) -> Tensor:
     """Weight and ramp-filter the rows of a scan: the first half of filtered backprojection.
 
@@ -183,8 +183,8 @@ def fbp(
     grid: VolumeGrid,
     kernel: str | Sequence[str] = "standard",
     *,
-    weights: Any = None,
-    motion: Any = None,
+    weights: object = None,
+    motion: object = None,
     outside: float | None = None,
 ) -> Tensor:
     """Filtered backprojection (Feldkamp, Davis and Kress, J. Opt. Soc. Am. A 1, 612, 1984, for a
@@ -422,7 +422,7 @@ class Fbp(nn.Module):
         self._handle = next(_HANDLES)
         _LAYERS[self._handle] = self
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: dict[str, object]) -> None:
         """Of a copy, or in another process: a handle of its own."""
         super().__setstate__(state)
         self._enter()
@@ -486,12 +486,21 @@ def _gradient_shape(sinogram: Tensor, gradient: Tensor, layer: int) -> Tensor:
     return torch.empty_like(sinogram)
 
 
-def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+class _LayerContext(Protocol):
+    """What a traced layer keeps for its derivative."""
+
+    layer: int
+    saved_tensors: tuple[Tensor, ...]
+
+    def save_for_backward(self, *tensors: Tensor) -> None: ...
+
+
+def _keep(ctx: _LayerContext, inputs: tuple[Tensor, int], output: Tensor) -> None:
     sinogram, ctx.layer = inputs
     ctx.save_for_backward(sinogram)
 
 
-def _back(ctx: Any, gradient: Tensor) -> Any:
+def _back(ctx: _LayerContext, gradient: Tensor) -> tuple[Tensor, None]:
     return _traced_gradient(*ctx.saved_tensors, gradient, ctx.layer), None
 
 
@@ -546,7 +555,7 @@ def _cut_sides(
     return sides
 
 
-def _footprint_or_all(geometry: Geometry, grid: VolumeGrid, motion: Any) -> DetectorWindow:
+def _footprint_or_all(geometry: Geometry, grid: VolumeGrid, motion: object) -> DetectorWindow:
     try:
         return footprint(geometry, grid, margin=1, motion=motion)
     except ValueError:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -22,6 +22,10 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, ParallelBeam, beam
 from torchpcct.threads import run
 from torchpcct.validate import shaped
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Reals
+
 
 CHUNK_BYTES = 48 * 2**20
 """Intermediate results of filtering are kept near this size; larger scans are processed in chunks
@@ -130,7 +134,7 @@ class FilterPlan:
             dtype=torch.promote_types(like.dtype, torch.complex32), device=like.device
         )
 
-    def _weights(self, like: Tensor) -> list[Any]:
+    def _weights(self, like: Tensor) -> list[Reals]:
         number = np.float64 if like.dtype == torch.float64 else np.float32
         rows = np.broadcast_to(self.cosine, (self.window_out.rows, self.geometry.columns))
         return [self.angular.astype(number), np.ascontiguousarray(rows, dtype=number)]

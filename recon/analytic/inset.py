@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,7 +141,7 @@ class InsetFbp:
         kernels: Sequence[str],
         *,
         surround: Tensor | None = None,
-        motion: Any = None,
+        motion: object = None,
     ) -> None:
         if surround is None and scan.counts.ndim != 3 and scan.geometry.has_rows:
             raise ValueError(

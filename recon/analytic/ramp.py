@@ -8,7 +8,7 @@ spline, as CatSim joins them.
 from __future__ import annotations
 
 from functools import cache, lru_cache
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,10 @@ from scipy.fft import next_fast_len
 
 from recon.names import KERNELS
 from torchpcct.validate import checked, choice
+
+if TYPE_CHECKING:
+    from scipy.interpolate import PPoly
+
 
 __all__ = ["apodization", "ramp_kernel"]
 
@@ -33,7 +37,7 @@ _POINTS: dict[str, tuple[float, ...]] = {
 }
 
 
-def _points(kernel: Any) -> tuple[float, ...]:
+def _points(kernel: object) -> tuple[float, ...]:
     if not isinstance(kernel, str):
         raise TypeError(
             f"kernel must be one of {', '.join(map(repr, KERNELS))}, got {type(kernel).__name__}"
@@ -42,7 +46,7 @@ def _points(kernel: Any) -> tuple[float, ...]:
 
 
 @cache
-def _window(kernel: str) -> Any:
+def _window(kernel: str) -> PPoly:
     """The window as ``scipy.interpolate.PPoly``."""
     from scipy.interpolate import PPoly, make_interp_spline
 

@@ -15,7 +15,7 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from recon.cli.looking import add_info, add_view
 from recon.cli.measuring import (
@@ -51,6 +51,10 @@ from recon.cli.scans import (
 from recon.cli.starting import add_demo, add_doctor, add_train, demo_steps, train
 from torchpcct import __version__
 from torchpcct.files import WriteError, speak_any_encoding
+
+if TYPE_CHECKING:
+    from recon.study.study import ProgressBars
+
 
 _GROUPS = {
     "begin": (add_demo, add_doctor),
@@ -123,7 +127,11 @@ class _Completion(argparse.Action):
     """Print the completion of a shell, and end."""
 
     def __call__(
-        self, parser: Any, namespace: Any, values: Any, option_string: str | None = None
+        self,
+        parser: Any,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
     ) -> None:
         try:
             import shtab
@@ -161,7 +169,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace, parser: Parser) -> int:
-    progress: Any = None
+    progress: ProgressBars | None = None
     try:
         check_limits(options, parser)
         from recon.study.study import ProgressBars
@@ -206,7 +214,7 @@ def _cuda() -> bool:
     return torch.cuda.is_available()
 
 
-def _failed(command: str, progress: Any, text: str, status: int) -> int:
+def _failed(command: str, progress: ProgressBars | None, text: str, status: int) -> int:
     if progress is not None:
         progress.close()
     print(f"torchpcct {command}: {text}", file=sys.stderr)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.parsing import (
@@ -25,6 +25,9 @@ from recon.cli.parsing import (
 from torchpcct.files import atomic_write
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from torch import Tensor
+
     from recon.study.study import ProgressBars
     from torchpcct.volume import Volume
 
@@ -75,7 +78,7 @@ def _info(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     if _is_volume(path):
         volume = Volume.load(path)
         values, length = volume.data.double(), length_of(volume.unit)
-        about: dict[str, Any] = {
+        about: dict[str, object] = {
             "kind": "volume",
             "shape": list(volume.grid.shape),
             f"spacing_{length}": list(volume.grid.spacing),
@@ -206,7 +209,7 @@ def _is_page(path: Path) -> bool:
 
 def _draw_slice(
     volume: Volume, plane: str, index: int | None, level: float, width: float
-) -> tuple[Any, int]:
+) -> tuple[Figure, int]:
     """Figure of a slice across the axis ``plane``, and its index (the middle, if None is given)."""
     import numpy as np
     from matplotlib.figure import Figure
@@ -242,7 +245,7 @@ def _draw_slice(
     return figure, index
 
 
-def _grey_scale(values: Any, level: float | None, window: float | None) -> tuple[float, float]:
+def _grey_scale(values: Tensor, level: float | None, window: float | None) -> tuple[float, float]:
     """Level and window: what was asked for; else 40 and 400 for HU, the values' own range for
     anything else."""
     import numpy as np

@@ -15,18 +15,26 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
 from torchpcct.files import WriteError, atomic_write, require_folder, require_writable
 from torchpcct.validate import meant, number, numbers, whole
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+    from types import FrameType
+
+    from torchpcct.typing import Json
+    from torchpcct.validate import Limits
+
 
 SCAN_ENDINGS = (".h5", ".hdf5")
 """Endings of scan files."""
 _BESIDE = (".json", ".yaml")
 """Endings of summary and configuration, which :func:`tell` adds to the name of the result."""
 
-Commands = Any
-"""What ``add_subparsers`` gives; argparse does not publish its type."""
+Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
+"""What ``add_subparsers`` gives."""
 
 
 _COMMON = "common options"
@@ -37,11 +45,11 @@ MOST = 4096
 """More processes or threads than a machine has use for."""
 MANY = 10**6
 """More views, realisations or particles than anything here can hold."""
-LENGTH: dict[str, Any] = {"positive": True, "high": 1e12, "unit": "mm"}
+LENGTH: Limits = {"positive": True, "high": 1e12, "unit": "mm"}
 """Limits of lengths: scans of any unit of length pass, slips of a power of ten by far do not."""
-EXPOSURE: dict[str, Any] = {"positive": True, "high": 1e6, "unit": "s"}
+EXPOSURE: Limits = {"positive": True, "high": 1e6, "unit": "s"}
 """Limits of exposures."""
-PLACE: dict[str, Any] = {"low": -1e12, "high": 1e12, "unit": "mm"}
+PLACE: Limits = {"low": -1e12, "high": 1e12, "unit": "mm"}
 """Limits of positions, as of lengths."""
 FORCE = ("--force", bool, None, "replace a file that another command or software has made")
 
@@ -114,7 +122,7 @@ def _text(text: str) -> str:
     return text
 
 
-_TYPES: dict[Any, Callable[[str], Any]] = {Path: _path, str: _text}
+_TYPES: dict[type, Callable[[str], object]] = {Path: _path, str: _text}
 """What nobody means by an empty text: a path would be the current folder."""
 _HINTS = {
     "scan": " (torchpcct simulate makes scans)",
@@ -194,7 +202,7 @@ def check_limits(arguments: argparse.Namespace, parser: Parser) -> None:
 def command(
     commands: Commands,
     name: str,
-    run: Callable[..., Any],
+    run: Callable[..., object],
     help: str,
     description: str,
     *lines: str,
@@ -328,7 +336,7 @@ def saying(actions: Sequence[argparse.Action], verbose: bool) -> Iterator[Callab
         root.setLevel(level)
 
 
-def as_json(value: Any, inset: str = "") -> str:
+def as_json(value: object, inset: str = "") -> str:
     """JSON with a line for every key; lists of numbers and texts, and of such lists, on one
     line."""
     deeper = inset + " "
@@ -345,7 +353,9 @@ def as_json(value: Any, inset: str = "") -> str:
     return brackets[0] + ",".join(f"\n{deeper}{line}" for line in lines) + f"\n{inset}{brackets[1]}"
 
 
-def tell(arguments: argparse.Namespace, short: str, config: dict[str, Any], **summary: Any) -> None:
+def tell(
+    arguments: argparse.Namespace, short: str, config: dict[str, object], **summary: object
+) -> None:
     """Write summary (JSON) and resolved configuration (YAML) beside the result, and print one
     line or, asked, all."""
     import yaml
@@ -416,7 +426,7 @@ _WORKERS_LOAD = "recon.evaluate.experiment"
 
 
 @contextmanager
-def executing(arguments: argparse.Namespace, out: Path) -> Iterator[Any]:
+def executing(arguments: argparse.Namespace, out: Path) -> Iterator[Executor | None]:
     """Run the jobs of a block where the options say, noted in ``OUT/jobs-DATE.log``; ``--dry-run``
     lists them.
 
@@ -467,7 +477,7 @@ def ending_by_signals() -> Iterator[None]:
     main = threading.current_thread() is threading.main_thread()
     mine = [n for n in numbers if main and signal.getsignal(n) is signal.SIG_DFL]
 
-    def on_signal(number: int, frame: Any) -> None:
+    def on_signal(number: int, frame: FrameType | None) -> None:
         for n in mine:
             signal.signal(n, signal.SIG_IGN)
         raise Ended(number)
@@ -524,7 +534,7 @@ def check_output(
 def check_results(
     arguments: argparse.Namespace,
     folder: Path,
-    is_own: Callable[[dict[str, Any]], bool],
+    is_own: Callable[[dict[str, Json]], bool],
     *patterns: str,
 ) -> None:
     """The same for a folder of results: files of these names are replaced if its ``report.json`` is
@@ -552,7 +562,7 @@ def is_picture(path: Path) -> bool:
     )
 
 
-def _json(path: Path) -> dict[str, Any]:
+def _json(path: Path) -> dict[str, Json]:
     """A JSON object in a file; empty if there is none."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))

@@ -51,8 +51,11 @@ from torchpcct.formats.volume_files import check_target, is_own_volume
 from torchpcct.validate import choice, memory_bytes
 
 if TYPE_CHECKING:
+    from recon.jobs.execute import Job
+    from recon.slabs import ScanSlices
     from recon.study.study import ProgressBars
     from torchpcct.acquisition.config import SimulationConfig
+    from torchpcct.scan import Scan
     from torchpcct.scene.voxels import VoxelScene
 
 _PAPER_VIEWS = 1968
@@ -422,7 +425,7 @@ def reader_options(arguments: argparse.Namespace) -> dict[str, Any]:
     return options
 
 
-def grid_of_scan(scan: Any, arguments: argparse.Namespace) -> VolumeGrid:
+def grid_of_scan(scan: Scan | ScanSlices, arguments: argparse.Namespace) -> VolumeGrid:
     """The grid that was asked for, see :meth:`torchpcct.VolumeGrid.of`."""
     return VolumeGrid.of(
         scan, voxel=arguments.voxel, extent=arguments.extent, center=arguments.center
@@ -566,7 +569,7 @@ def _reconstruct_elsewhere(arguments: argparse.Namespace, progress: ProgressBars
     print(text)
 
 
-def _job(arguments: argparse.Namespace, scan: Path, out: str) -> Any:
+def _job(arguments: argparse.Namespace, scan: Path, out: str) -> Job:
     """The reconstruction of a scan into a folder's file ``out``."""
     from recon.jobs import execute
 
@@ -720,7 +723,10 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
 
 
 def _config(
-    arguments: argparse.Namespace, scan: Any, grid: VolumeGrid, options: dict[str, Any]
+    arguments: argparse.Namespace,
+    scan: Scan | ScanSlices,
+    grid: VolumeGrid,
+    options: dict[str, Any],
 ) -> dict[str, Any]:
     from torchpcct.formats.geometry_yaml import geometry_values
 

@@ -11,11 +11,15 @@ from collections.abc import Callable
 from importlib import util
 from importlib.machinery import PathFinder
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.parsing import FORCE, Commands, add_options, examples
 from torchpcct.files import require_writable
+
+if TYPE_CHECKING:
+    from recon.study.study import ProgressBars
+
 
 _DEMO_VIEWS = 984
 
@@ -128,7 +132,7 @@ def add_train(commands: Commands) -> None:
 # --- doctor ---------------------------------------------------------------------------------------
 
 
-def _doctor(arguments: argparse.Namespace, progress: Any) -> int:
+def _doctor(arguments: argparse.Namespace, progress: ProgressBars) -> int:
     from recon.cli.doctor import outcomes  # loads all that it looks at
 
     broken = 0

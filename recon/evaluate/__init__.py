@@ -19,7 +19,7 @@ Your denoiser on a lung nodule:
 """
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from recon.evaluate.experiment import Evaluation, evaluate, export_scans
@@ -68,7 +68,7 @@ _SOURCES = {
 }
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """A name of another module, which loads (torch, numba) when the name is first used."""
     for module, names in _SOURCES.items():
         if name in names:

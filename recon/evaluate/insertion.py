@@ -22,7 +22,6 @@ import math
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -149,7 +148,7 @@ class ContrastRecovery:
             return "as much"
         return "more" if d.mean() > 0 else "less"
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """JSON values."""
         return {
             "method": self.method,

@@ -122,7 +122,7 @@ class Method:
     is_fbp: bool = False
     network: Mbir | None = None
     energies: str | None = None
-    made: tuple[Callable[..., Any], tuple[Any, ...]] | None = None
+    made: tuple[Callable[..., Method], tuple[object, ...]] | None = None
 
     def __reduce__(self) -> Any:
         return self.made or (Method, tuple(getattr(self, f.name) for f in fields(self)))
@@ -202,7 +202,7 @@ def _named(spec: str) -> Method:
     return _of_function(spec, loaded(spec))
 
 
-def denoiser(function: Callable[..., Any], base: Any, name: str = "") -> Method:
+def denoiser(function: Callable[..., object], base: object, name: str = "") -> Method:
     """A function of an image after a linear method.
 
     Args:
@@ -346,7 +346,7 @@ def same_grid(first: VolumeGrid, second: VolumeGrid) -> bool:
     return all(abs(a - b) * n <= 1e-3 * b and abs(c - d) <= 1e-3 * b for a, b, c, d, n in pairs)
 
 
-def _source_of(function: Callable[..., Any]) -> str:
+def _source_of(function: Callable[..., object]) -> str:
     """SHA-256 of a function's source, and of the networks and plain values that it uses from
     outside."""
     kind = type(function) if isinstance(function, nn.Module) else function
@@ -354,7 +354,7 @@ def _source_of(function: Callable[..., Any]) -> str:
         text = inspect.getsource(kind)
     except (OSError, TypeError):
         text = repr(kind)
-    used: dict[str, Any] = {"": function}
+    used: dict[str, object] = {"": function}
     if isinstance(function, PlugAndPlay):
         return _source_of(function.denoiser)
     if inspect.isfunction(function):

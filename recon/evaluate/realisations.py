@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, cached_property, partial
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -36,6 +36,15 @@ from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 
 _SIGMA_SEEDS = (900_001, 900_002)
 """Realisations that a denoiser's noise level is measured on; none of them is evaluated."""
+
+
+class _Reader(Protocol):
+    """What is read of volumes, as :class:`recon.evaluate.measure.Reader` does."""
+
+    @property
+    def weights(self) -> Tensor:
+        """``(2 · rois, z, y, x)``, of ROI means."""
+        ...
 
 
 class Realisations:
@@ -124,7 +133,9 @@ class Realisations:
             k: self.store.piece(f"{self.prefix}exact_{k}", key, partial(of, k)) for k in kernels
         }
 
-    def response(self, network: Mbir, reader: Any, exposure_s: float) -> dict[str, Any]:
+    def response(
+        self, network: Mbir, reader: _Reader, exposure_s: float
+    ) -> dict[str, NDArray[np.float64]]:
         """``adjoints`` ``(2 · rois, z, y, x)`` of MBIR's ROI means, ``mean`` and ``covariance``
         of what they give."""
         both = [self.noise_free(p, exposure_s).term for p in (True, False)]

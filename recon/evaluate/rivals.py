@@ -7,7 +7,6 @@ import json
 import math
 from functools import cache
 from importlib import resources
-from typing import Any
 
 from recon.filters import (
     FILTERS,
@@ -18,14 +17,14 @@ __all__ = ["tuned"]
 
 
 @cache
-def _tuning() -> Any:
+def _tuning() -> dict[str, dict[str, dict[str, dict[str, float]]]]:
     return json.loads(
         (resources.files("recon") / "evaluate" / "rivals_tuning.json").read_text(encoding="utf-8")
     )
 
 
 @checked
-def tuned(name: str, kernel: str, exposure_s: float) -> dict[str, Any]:
+def tuned(name: str, kernel: str, exposure_s: float) -> dict[str, float]:
     """Settings of a filter after FBP on 0.2 mm voxels that have the least error in vessels of four
     directions.
 
@@ -50,5 +49,5 @@ def tuned(name: str, kernel: str, exposure_s: float) -> dict[str, Any]:
     nearest = min(
         _tuning().items(), key=lambda item: abs(math.log(float(item[0].split()[0]) / exposure))
     )[1]
-    found: dict[str, Any] = dict(nearest.get(f"{kernel} + {name}", {}).get("settings", {}))
+    found: dict[str, float] = dict(nearest.get(f"{kernel} + {name}", {}).get("settings", {}))
     return found

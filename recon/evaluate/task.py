@@ -25,7 +25,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
@@ -45,6 +45,14 @@ from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.scanner.scanner import Scanner
 from torchpcct.scene.scene import Scene
 from torchpcct.validate import numbers
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import ArrayLike
+
+    from torchpcct.typing import Bools
+
 
 __all__ = ["Task"]
 
@@ -209,7 +217,7 @@ class Task:
         ]
         return hashlib.sha256(f"{plain} {digest}".encode()).hexdigest()[:16]
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """Without what it has kept of its own computations, to be sent."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
@@ -364,7 +372,7 @@ class Task:
             f"{name!r}, {_FEW} are needed: take smaller voxels, or an inset that holds it"
         )
 
-    def _small(self, signal: Any, around: Any, here: Any) -> tuple[Any, Any]:
+    def _small(self, signal: Bools, around: Bools, here: Bools) -> tuple[Bools, Bools]:
         """Voxels of one slice in the middle of the signal, and near to them where the background
         is not thin."""
         step = self.grid.spacing
@@ -519,7 +527,7 @@ def contrast_bound(information: Floats) -> float:
     return math.sqrt(cramer_rao_bound(information, second - first).item())
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     """What a value is made of, without what it has kept of its own computations."""
     if isinstance(value, np.ndarray | Tensor):
         array = np.ascontiguousarray(value)
@@ -541,19 +549,19 @@ def _inner(a: Tensor, b: Tensor) -> float:
     return float((a * b).sum((-1, -2), dtype=torch.float64).sum())
 
 
-def _mean(mask: Any) -> Tensor:
+def _mean(mask: ArrayLike) -> Tensor:
     weights = torch.from_numpy(np.asarray(mask, dtype=np.float64))
     return weights / weights.sum()
 
 
-def _depth(mask: Any, step: Any) -> Floats:
+def _depth(mask: Bools, step: Sequence[float]) -> Floats:
     """Distance in mm to where the mask ends."""
     return np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1, mode="edge"), sampling=step))[
         1:-1, 1:-1, 1:-1
     ]
 
 
-def _nearest(mask: Any, point: Any, count: int) -> NDArray[np.bool_]:
+def _nearest(mask: Bools, point: Sequence[float | np.integer], count: int) -> NDArray[np.bool_]:
     """The ``count`` voxels of a mask that are nearest to a point (in voxels)."""
     at = np.argwhere(mask)
     order = np.square(at - np.asarray(point)).sum(1).argsort(kind="stable")[:count]

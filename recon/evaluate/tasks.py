@@ -99,7 +99,7 @@ def read_task(what: TaskLike) -> Task:
         return _task(read_yaml(file, "a task"), str(what), file.parent)
 
 
-def _task(values: Any, name: str, folder: Path) -> Task:
+def _task(values: object, name: str, folder: Path) -> Task:
     if not isinstance(values, Mapping):
         raise ValueError(
             f"task {name} must be a mapping with {', '.join(_KEYS)}; see torchpcct show-task"
@@ -156,7 +156,7 @@ def _task(values: Any, name: str, folder: Path) -> Task:
     return replace(task, rois=_protocol(plaque_scene(**options)[1], grid))
 
 
-def _inset(name: str, value: Any, scene: Scene, signal: tuple[str, ...]) -> VolumeGrid:
+def _inset(name: str, value: object, scene: Scene, signal: tuple[str, ...]) -> VolumeGrid:
     """A grid as of ``region``; or of ``size`` mm about the signal, in voxels of ``voxel_mm``."""
     if not isinstance(value, Mapping) or "size" not in value:
         return grid_of(name, value)
@@ -190,7 +190,7 @@ def _inset(name: str, value: Any, scene: Scene, signal: tuple[str, ...]) -> Volu
     return VolumeGrid(shape, voxel, tuple(float(c) for c in boxes[-1].mean(0)[::-1]))
 
 
-def _labels(name: str, value: Any, folder: Path) -> dict[str, Any]:
+def _labels(name: str, value: object, folder: Path) -> dict[str, object]:
     """``file`` and ``tissues`` of a task's ``voxels``."""
     if (
         not isinstance(value, Mapping)
@@ -213,7 +213,7 @@ def _labels(name: str, value: Any, folder: Path) -> dict[str, Any]:
     return {"labels": np.asarray(volume.data), "spacing": volume.grid.spacing, "tissues": tissues}
 
 
-def _protocol(plaque: Plaque, grid: VolumeGrid) -> dict[str, Any]:
+def _protocol(plaque: Plaque, grid: VolumeGrid) -> dict[str, tuple[Tensor, Tensor]]:
     """The ROIs of the paper, and the same two tissues in the whole section and in all slices of
     the core."""
     plain = plaque_scene(plaque)[0]
@@ -226,7 +226,10 @@ def _protocol(plaque: Plaque, grid: VolumeGrid) -> dict[str, Any]:
             plain, VolumeGrid((max(1, int(2 * half / 0.05)), 64, 64), 0.05, (z, y, x))
         ),
     }
-    return {name: tuple(roi.weights for roi in pair.on(grid)) for name, pair in pairs.items()}
+    return {
+        name: (a.weights, b.weights)
+        for name, (a, b) in ((name, pair.on(grid)) for name, pair in pairs.items())
+    }
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -84,7 +83,7 @@ class VesselAxis:
         return result
 
     @property
-    def axes(self) -> tuple[Any, Any, Any]:
+    def axes(self) -> tuple[tuple[float, float, float], Floats, tuple[float, float, float]]:
         """Unit vectors at the origin: towards the plaque, across, along."""
         return self.side, np.cross(self.tangent, self.side), self.tangent
 

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -36,6 +36,10 @@ from torchpcct.projector.operator import apply_linear
 from torchpcct.switches import undisturbed
 from torchpcct.threads import run
 from torchpcct.validate import number
+
+if TYPE_CHECKING:
+    from torchpcct.projector import Projector
+
 
 __all__ = ["Gram"]
 
@@ -174,7 +178,7 @@ class Gram:
     """
 
     @undisturbed
-    def __init__(self, projector: Any, weights: Tensor, nodes: int = 9) -> None:
+    def __init__(self, projector: Projector, weights: Tensor, nodes: int = 9) -> None:
         check_weights(weights, projector.range_shape)
         self.dtype = weights.dtype
         self.grid = projector.grid
@@ -197,7 +201,7 @@ class Gram:
 
     # -- construction ------------------------------------------------------------------------------
 
-    def _fit(self, projector: Any, weights: Tensor, positions: Nodes) -> Tensor:
+    def _fit(self, projector: Projector, weights: Tensor, positions: Nodes) -> Tensor:
         """Kernels K_c, ``(terms, bands, nz, 2·ny − 1, 2·nx − 1)``."""
         ny, nx = self.grid.shape[-2:]
         reach = slice_reach(projector.geometry, self.grid)
@@ -268,7 +272,7 @@ class Gram:
         plain = self._transform(x3)
         total = torch.zeros_like(plain)
         _banded_add(spectra[0], plain, self.factor, total)
-        out: Any = 0.0
+        out: Tensor | float = 0.0
         for b, kernel in zip(basis[1:], spectra[1:], strict=True):
             _banded_add(kernel, self._transform(b * x3), 0.5 * self.factor, total)
             part = torch.zeros_like(plain)
@@ -419,7 +423,7 @@ def information_at(
     return found * mu_per_hu**2 / math.prod(spacing)
 
 
-def check_weights(weights: Any, shape: tuple[int, ...]) -> None:
+def check_weights(weights: object, shape: tuple[int, ...]) -> None:
     """Refuse weights that are not finite, ≥ 0 and of the given shape, or all 0 (TypeError,
     ValueError)."""
     if not isinstance(weights, Tensor) or weights.dtype not in (torch.float32, torch.float64):

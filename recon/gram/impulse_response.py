@@ -9,13 +9,17 @@ that neighbouring slices differ by tens of per cent.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
+
+if TYPE_CHECKING:
+    from torchpcct.projector import Projector
+
 
 Nodes = tuple[tuple[float, float], ...]
 
@@ -55,7 +59,7 @@ def slice_reach(geometry: Geometry, grid: VolumeGrid) -> int:
     return min(max(math.ceil(lag) - 1, 0), nz - 1)
 
 
-def kernel_at(projector: Any, weights: Tensor, node: tuple[int, int], reach: int) -> Tensor:
+def kernel_at(projector: Projector, weights: Tensor, node: tuple[int, int], reach: int) -> Tensor:
     """Impulse responses of AᵀWA for all slices of one voxel column.
 
     Args:

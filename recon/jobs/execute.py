@@ -48,12 +48,16 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from recon.jobs.sources import source_digest
 from torchpcct.files import VERSION, WriteError, atomic_write, is_foreign, marker
 from torchpcct.kernel_cache import compiled_once
 from torchpcct.validate import whole
+
+if TYPE_CHECKING:
+    from types import FrameType, TracebackType
+
 
 __all__ = ["Cluster", "Job", "LeftOut", "Processes", "Unfit", "Unportable", "using"]
 
@@ -119,7 +123,7 @@ class Job:
     """
 
     name: str
-    function: Callable[..., Any]
+    function: Callable[..., object]
     args: tuple[Any, ...]
     makes: tuple[str, ...] = ()
     after: tuple[str, ...] = ()
@@ -146,7 +150,7 @@ class _Done:
     """What comes back: ``said`` is what was logged as a warning."""
 
     where: str
-    value: Any = None
+    value: object = None
     files: dict[str, bytes] = field(default_factory=dict)
     seconds: float = 0.0
     compiled_s: float = 0.0
@@ -175,6 +179,9 @@ def using(executor: Executor | None) -> Iterator[None]:
         _current.reset(token)
 
 
+T = TypeVar("T")
+
+
 class Processes(ThreadPoolExecutor):
     """Processes of this machine. Each has a thread that waits for it, and is replaced if it dies.
 
@@ -194,12 +201,12 @@ class Processes(ThreadPoolExecutor):
         for _ in range(workers):
             self.submit(_load, preload)
 
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         """See :class:`concurrent.futures.Executor`; ``BrokenProcessPool`` is the death of this
         job's process alone."""
         return super().submit(self._in_process, fn, *args, **kwargs)
 
-    def _in_process(self, fn: Callable[..., Any], *args: Any) -> Any:
+    def _in_process(self, fn: Callable[..., T], *args: object) -> T:
         pool: Pool | None = getattr(self._own, "pool", None)
         if pool is None:
             pool = Pool(
@@ -221,7 +228,12 @@ class Processes(ThreadPoolExecutor):
             self._own.pool = None
             raise
 
-    def __exit__(self, kind: Any, value: Any, trace: Any) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         """What is running is finished, but for an interruption (Ctrl-C, a signal of the system)."""
         if kind is not None and issubclass(kind, KeyboardInterrupt):
             self.end()
@@ -300,7 +312,7 @@ def _begin_process(safe_path: str | None) -> None:
     """
     _set_safe_path(safe_path)
 
-    def on_signal(number: int, frame: Any) -> None:
+    def on_signal(number: int, frame: FrameType | None) -> None:
         if not _working:
             os._exit(128 + number)
         raise _EndSignal(number)
@@ -386,14 +398,12 @@ class Cluster(Executor):
         """Address of the scheduler's page."""
         return str(self.client.dashboard_link)
 
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         """See :class:`concurrent.futures.Executor`."""
         # Machines, not workers: one that dies is started again under another address.
         only = {"workers": sorted(set(map(_machine, self._addresses)))} if self.avoid else {}
         kwargs["key"] = f"torchpcct-{secrets.token_hex(16)}"
-        found: Future[Any] = self.client.get_executor(pure=False, **only).submit(
-            fn, *args, **kwargs
-        )
+        found: Future[T] = self.client.get_executor(pure=False, **only).submit(fn, *args, **kwargs)
         self._given[kwargs["key"]] = found
         return found
 
@@ -589,7 +599,7 @@ def _do_job(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _
 # --- the client -----------------------------------------------------------------------------------
 
 
-def packed_call(executor: Executor | None, value: Any) -> bytes:
+def packed_call(executor: Executor | None, value: object) -> bytes:
     """A value as a job of this executor carries it.
 
     Raises:
@@ -608,7 +618,7 @@ def run(
     folder: Path,
     executor: Executor | None,
     progress: Progress | None = None,
-    finished: Callable[[Job], Any] | None = None,
+    finished: Callable[[Job], object] | None = None,
 ) -> dict[str, Any]:
     """Run jobs, as many at once as there are workers.
 
@@ -655,7 +665,7 @@ def _run_here(
     jobs: Sequence[Job],
     folder: Path,
     progress: Progress | None,
-    finished: Callable[[Job], Any] | None,
+    finished: Callable[[Job], object] | None,
 ) -> dict[str, Any]:
     values = {}
     for k, job in enumerate(jobs):
@@ -682,7 +692,7 @@ def _run(
     of: _Run,
     book: _Log,
     progress: Progress | None,
-    finished: Callable[[Job], Any] | None,
+    finished: Callable[[Job], object] | None,
 ) -> dict[str, Any]:
     names = {job.name for job in jobs}
     needs = {job.name: names.intersection(job.after) for job in jobs}

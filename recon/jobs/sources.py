@@ -8,7 +8,6 @@ import functools
 import hashlib
 import importlib.util
 from pathlib import Path
-from typing import Any
 
 from torchpcct.files import VERSION
 from torchpcct.kernel_cache import OURS
@@ -75,7 +74,7 @@ def _source(name: str) -> tuple[str, bool, tuple[tuple[str, str], ...]] | None:
     if spec is None or spec.origin is None:
         return None
     found, package = [], spec.submodule_search_locations is not None
-    nodes: list[Any] = [ast.parse(Path(spec.origin).read_bytes())]
+    nodes: list[ast.AST] = [ast.parse(Path(spec.origin).read_bytes())]
     while nodes:
         node = nodes.pop()
         if isinstance(node, ast.Import):

@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from torchpcct.files import LEFTOVER, abandoned, atomic_write, is_foreign, read_
 
 if TYPE_CHECKING:
     from torchpcct.scan import Scan
+    from torchpcct.typing import Array
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +41,7 @@ _SCAN = re.compile(r"-[0-9a-f]{16}\.h5$")
 """Names of kept scans end so, with a task's fingerprint."""
 
 
-def _digest(key: str, arrays: Mapping[str, Any]) -> str:
+def _digest(key: str, arrays: Mapping[str, Array]) -> str:
     total = hashlib.sha256(key.encode())
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
@@ -78,7 +79,7 @@ class Store:
         except Exception:  # none, or damaged
             return False
 
-    def piece(self, name: str, key: str, compute: Callable[[], Any]) -> Any:
+    def piece(self, name: str, key: str, compute: Callable[[], T]) -> T:
         """What a piece holds: read if it was finished with the same key, else computed and written.
 
         A file of that name that no store wrote stays, and the piece is not kept.
@@ -112,7 +113,7 @@ class Store:
         if foreign:
             return unpacked(arrays)
         digest = _digest(key, arrays)
-        sealed = {
+        sealed: dict[str, Any] = {
             "key": np.array(key),
             "sum": np.array(digest),
             _MARK: np.array(path.name),
@@ -196,7 +197,7 @@ class Pieces:
 
     FOLDER = "pieces"
 
-    def __init__(self, folder: str | Path | None, settings: Any) -> None:
+    def __init__(self, folder: str | Path | None, settings: object) -> None:
         self._store = None if folder is None else Store(Path(folder) / self.FOLDER)
         self._key = "" if folder is None else f"{settings!r} {_study_digest(settings)}"
         self._settings, self._prefix = settings, ""
@@ -219,7 +220,7 @@ class Pieces:
         found: T = self._store.piece(self._prefix + name, self._key, compute)
         return found
 
-    def ahead(self, function: Callable[..., Any], *calls: tuple[Any, ...]) -> None:
+    def ahead(self, function: Callable[..., object], *calls: tuple[object, ...]) -> None:
         """Let other processes compute pieces of calls that are independent, before this one reads
         them one by one.
 
@@ -276,21 +277,25 @@ class Pieces:
 
 
 def _ahead(
-    root: Path, settings: Any, prefix: str, function: Callable[..., Any], call: tuple[Any, ...]
+    root: Path,
+    settings: object,
+    prefix: str,
+    function: Callable[..., object],
+    call: tuple[object, ...],
 ) -> None:
     pieces = Pieces(root.parent, settings)
     pieces._prefix = prefix
     function(settings, pieces, *call)
 
 
-def _study_digest(settings: Any) -> str:
+def _study_digest(settings: object) -> str:
     """Of the module of a study, in which its settings stand beside its measuring, with all it
     imports."""
     module = type(settings).__module__
     return source_digest(module) if module.startswith("recon.") else source_digest()
 
 
-def packed(value: Any) -> dict[str, Any]:
+def packed(value: object) -> dict[str, Array]:
     """Arrays, and under ``tree`` the JSON text of what they make up, for :meth:`Store.piece`.
 
     Args:
@@ -301,11 +306,11 @@ def packed(value: Any) -> dict[str, Any]:
     Raises:
         TypeError: a value of another kind.
     """
-    arrays: dict[str, Any] = {}
+    arrays: dict[str, Array] = {}
     return {"tree": np.array(json.dumps(_packed(value, arrays))), **arrays}
 
 
-def _packed(value: Any, arrays: dict[str, Any]) -> Any:
+def _packed(value: object, arrays: dict[str, Array]) -> object:
     if value is None or type(value) in (bool, int, float, str):
         return value
     if isinstance(value, np.ndarray | np.generic | torch.Tensor):
@@ -334,7 +339,7 @@ def _packed(value: Any, arrays: dict[str, Any]) -> Any:
     raise TypeError(f"a piece of a study cannot hold a {kind.__module__}.{kind.__qualname__}")
 
 
-def unpacked(arrays: Mapping[str, Any]) -> Any:
+def unpacked(arrays: Mapping[str, Array]) -> Any:
     """The value of :func:`packed`.
 
     Raises:
@@ -343,7 +348,7 @@ def unpacked(arrays: Mapping[str, Any]) -> Any:
     return _unpacked(json.loads(str(arrays["tree"])), arrays)
 
 
-def _unpacked(tree: Any, arrays: Mapping[str, Any]) -> Any:
+def _unpacked(tree: Any, arrays: Mapping[str, Array]) -> Any:
     if not isinstance(tree, dict):
         return tree
     ((kind, of),) = tree.items()
@@ -359,7 +364,7 @@ def _unpacked(tree: Any, arrays: Mapping[str, Any]) -> Any:
         return {_unpacked(k, arrays): _unpacked(v, arrays) for k, v in of}
     module, name, parts = of
     ours = module.startswith(("torchpcct.", "recon."))
-    made: Any = getattr(importlib.import_module(module), name) if ours else None
+    made: type | None = getattr(importlib.import_module(module), name) if ours else None
     if made is None or not is_dataclass(made):
         raise ValueError(f"a piece holds a {module}.{name}, which is no dataclass of this software")
-    return cast(Any, made)(**{k: _unpacked(v, arrays) for k, v in parts.items()})
+    return made(**{k: _unpacked(v, arrays) for k, v in parts.items()})

@@ -23,7 +23,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -32,6 +32,10 @@ from torch import Tensor
 from recon.gram.gram import REFERENCE_FREQUENCY, check_weights, information_at
 from recon.least_squares.model_solver import mean_share
 from recon.least_squares.qggmrf import BoundPrior
+
+if TYPE_CHECKING:
+    from torchpcct.projector import Projector
+
 
 LEAST = 0.02
 """Smallest eigenvalue of K, as a share of the median one: between the views' directions it is 0 or,
@@ -71,7 +75,7 @@ class FieldModel:
             no ray meets.
     """
 
-    def __init__(self, projector: Any, weights: Tensor) -> None:
+    def __init__(self, projector: Projector, weights: Tensor) -> None:
         check_weights(weights, tuple(projector.range_shape))
         self.grid = projector.grid
         self.seen: Tensor = projector.T(weights)

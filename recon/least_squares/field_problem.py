@@ -29,6 +29,7 @@ from torchpcct.vector_geometry import VectorGeometry
 from torchpcct.volume import in_words, to_hu
 
 if TYPE_CHECKING:
+    from torchpcct.geometry import Geometry
     from torchpcct.metrics.residual_test import ResidualTest
 
 __all__ = ["FieldProblem"]
@@ -230,7 +231,7 @@ class FieldProblem:
         return residual_test(*tested, unknowns=self.work.voxels)
 
 
-def larger_grid(grid: VolumeGrid, geometry: Any) -> VolumeGrid:
+def larger_grid(grid: VolumeGrid, geometry: Geometry) -> VolumeGrid:
     """The grid with as many voxels more on each side as it takes to hold all that the rays cross.
 
     Args:

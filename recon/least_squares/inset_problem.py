@@ -32,6 +32,8 @@ from torchpcct.switches import undisturbed
 __all__ = ["InsetProblem"]
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from torchpcct.metrics.residual_test import ResidualTest
 
 
@@ -118,7 +120,7 @@ class InsetProblem:
                 f"whole field: {error}; or take a grid that holds the whole field of view"
             ) from error
 
-    def _place(self, motion: Any) -> None:
+    def _place(self, motion: ArrayLike | None) -> None:
         geometry, grid = self.geometry, self.grid
         self.window = footprint(geometry, grid, margin=1, motion=motion)
         self.weights = self.window.take(self._cell_weights).contiguous()
@@ -157,7 +159,7 @@ class InsetProblem:
         return self.model
 
     @undisturbed
-    def with_motion(self, motion: Any) -> InsetProblem:
+    def with_motion(self, motion: ArrayLike | None) -> InsetProblem:
         """The same problem for an inset that moves.
 
         The background stands still; it is taken off before, so that only what moves is projected.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -13,6 +13,10 @@ from recon.gram.impulse_response import slice_reach
 from torchpcct.devices import available_bytes
 from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.validate import whole
+
+if TYPE_CHECKING:
+    from torchpcct.projector import Projector
+
 
 VOLUMES = 21
 """Arrays of one volume's size that live at once: right-hand side, volume, gradients, two steps with
@@ -29,7 +33,7 @@ def resident_bytes() -> int:
         return 0
 
 
-def pwls_bytes(A: Any, batch: int, dtype: torch.dtype, device: torch.device) -> int:
+def pwls_bytes(A: Projector, batch: int, dtype: torch.dtype, device: torch.device) -> int:
     """Largest memory that :func:`recon.least_squares.pwls.pwls` needs besides its arguments.
 
     Args:
@@ -50,7 +54,7 @@ def pwls_bytes(A: Any, batch: int, dtype: torch.dtype, device: torch.device) -> 
     return int(inside + item * (VOLUMES * volume + SINOGRAMS * data))
 
 
-def require_memory(A: Any, batch: int, like: Tensor, memory: int | None) -> None:
+def require_memory(A: Projector, batch: int, like: Tensor, memory: int | None) -> None:
     """Refuse a reconstruction that does not fit into ``memory`` bytes.
 
     Args:

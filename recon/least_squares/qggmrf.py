@@ -32,7 +32,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -41,6 +41,14 @@ from torch import Tensor
 
 from torchpcct.threads import run
 from torchpcct.validate import number
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import DTypeLike
+
+    from torchpcct.typing import Array, Reals
+
 
 __all__ = ["QGGMRF"]
 
@@ -348,17 +356,19 @@ class BoundPrior:
         sums = torch.from_numpy(rows.sum(axis=(1, 2))).reshape(*x.shape[: x.dim() - self.axes], 2)
         return sums[..., 0], sums[..., 1]
 
-    def _by_rows(self, kernel: Any, x: NDArray[Any], *rest: Any) -> None:
+    def _by_rows(
+        self, kernel: Callable[..., None], x: NDArray[np.float32 | np.float64], *rest: object
+    ) -> None:
         rows = len(x) * x.shape[-3] * x.shape[-2]
         run(kernel, rows, x, *rest, operations=4 * len(self.offsets) * x.size // rows)
 
-    def _volumes(self, x: Tensor) -> NDArray[Any]:
+    def _volumes(self, x: Tensor) -> NDArray[np.float32 | np.float64]:
         """``(batch, channels, nz, ny, nx)`` contiguous."""
         n = len(self.spacing)
         shape = (x.shape[-self.axes] if self.channels else 1, *(1,) * (3 - n), *x.shape[-n:])
         return x.detach().reshape(-1, *shape).contiguous().numpy()
 
-    def _tables(self, dtype: Any, both: bool) -> tuple[Any, ...]:
+    def _tables(self, dtype: DTypeLike, both: bool) -> tuple[Array, Array, Reals, int, Reals]:
         """Arguments of the kernels: neighbours, scales, factors, kind and form of the potential."""
         steps, scales, factors = [], [], []
         for step, d, omega in self.offsets:

@@ -29,7 +29,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -50,6 +50,9 @@ from torchpcct.scan import Scan
 from torchpcct.volume import to_hu
 
 if TYPE_CHECKING:
+    from types import EllipsisType
+
+    from torchpcct.geometry import Geometry
     from torchpcct.metrics.residual_test import ResidualTest  # loads scipy.stats
 
 VOXELS_PER_CELL = (0.7, 1.5)
@@ -149,7 +152,7 @@ def _turned(spectrum: Tensor, shape: Sequence[int]) -> Tensor:
     return mean[..., index].reshape(spectrum.shape)
 
 
-def trained_grid(grid: VolumeGrid, geometry: Any) -> VolumeGrid:
+def trained_grid(grid: VolumeGrid, geometry: Geometry) -> VolumeGrid:
     """The grid of cubic voxels that the network can work on; ``grid`` itself if it is one.
 
     Args:
@@ -214,7 +217,7 @@ def blockwise(
         torch.zeros(shape, dtype=estimate.dtype, device=estimate.device),
     )
     for part in _parts(shape, block, halo):
-        here: Any = (..., *part)
+        here: tuple[EllipsisType | slice, ...] = (..., *part)
         seen = estimate[here]
         out = same_kind(
             network(

@@ -15,7 +15,7 @@ from dataclasses import replace
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -32,6 +32,10 @@ from recon.result import Result
 from torchpcct.geometry import VolumeGrid
 from torchpcct.switches import undisturbed
 from torchpcct.volume import in_words
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
 
 __all__ = ["Mbir"]
 
@@ -87,7 +91,10 @@ class Mbir:
     @classmethod
     @undisturbed
     def load(
-        cls, path: str | Path | None = None, fidelity: float = DEFAULT_FIDELITY, network: Any = None
+        cls,
+        path: str | Path | None = None,
+        fidelity: float = DEFAULT_FIDELITY,
+        network: object = None,
     ) -> Mbir:
         """From a weights file; None: the weights that ship with the package.
 
@@ -480,7 +487,7 @@ def average_onto(volume: Tensor, source: VolumeGrid, target: VolumeGrid) -> Tens
     return volume
 
 
-def overlap(source: VolumeGrid, target: VolumeGrid, axis: int) -> np.ndarray[Any, Any]:
+def overlap(source: VolumeGrid, target: VolumeGrid, axis: int) -> NDArray[np.float64]:
     """How much of each target voxel lies in each source voxel along an axis, ``(target,
     source)``, as shares."""
     at, width = target.axes[axis][:, None], target.spacing[axis]

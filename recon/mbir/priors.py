@@ -58,7 +58,7 @@ class PlugAndPlay(nn.Module):
             as a filter of :mod:`recon.filters` has it, else 0.
     """
 
-    def __init__(self, denoiser: Callable[..., Any], smoothed_by: float | None = None) -> None:
+    def __init__(self, denoiser: Callable[..., object], smoothed_by: float | None = None) -> None:
         super().__init__()
         self.denoiser = denoiser
         usual = next((width for known, width in _SMOOTHED if known is denoiser), 0.0)
@@ -100,7 +100,7 @@ class PlugAndPlay(nn.Module):
         return torch.stack(found)
 
 
-def prior_of(given: Any) -> Prior:
+def prior_of(given: object) -> Prior:
     """A prior from what a user gives.
 
     Args:
@@ -147,7 +147,7 @@ def prior_of(given: Any) -> Prior:
     )
 
 
-def _takes_any(function: Callable[..., Any]) -> bool:
+def _takes_any(function: Callable[..., object]) -> bool:
     call = function.forward if isinstance(function, nn.Module) else function
     try:
         return any(p.kind is p.VAR_POSITIONAL for p in inspect.signature(call).parameters.values())
@@ -155,7 +155,7 @@ def _takes_any(function: Callable[..., Any]) -> bool:
         return False
 
 
-def name_of(prior: Any) -> str:
+def name_of(prior: object) -> str:
     """What messages and reports call a prior."""
     if isinstance(prior, PlugAndPlay):
         return name_of(prior.denoiser)
@@ -166,7 +166,7 @@ def name_of(prior: Any) -> str:
     return str(getattr(prior, "__name__", type(prior).__name__))
 
 
-def same_kind(made: Any, given: Tensor, prior: Any) -> Tensor:
+def same_kind(made: object, given: Tensor, prior: object) -> Tensor:
     """What a prior or denoiser has returned for ``given``, if it has its shape, precision and
     device.
 
@@ -191,7 +191,7 @@ def same_kind(made: Any, given: Tensor, prior: Any) -> Tensor:
     return made
 
 
-def network_of(values: Mapping[str, Any], named: Any = None) -> nn.Module:
+def network_of(values: Mapping[str, Any], named: object = None) -> nn.Module:
     """The network that a training's configuration or the header of its weights describes, with
     random weights.
 

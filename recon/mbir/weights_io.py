@@ -38,7 +38,7 @@ def digest(tensors: Mapping[str, Tensor]) -> str:
 
 
 def write_tensors(
-    path: Path, kind: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]
+    path: Path, kind: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, object]
 ) -> None:
     """Write a file, whole or not at all.
 

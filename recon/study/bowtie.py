@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,14 @@ from torchpcct.scene.phantoms.quality import ctdi, water_cylinder
 from torchpcct.scene.phantoms.thorax import thorax
 from torchpcct.validate import choice, number, numbers
 from torchpcct.volume import to_hu
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike
+
+    from torchpcct.typing import Bools
+
 
 Floats = NDArray[np.float64]
 
@@ -217,7 +225,7 @@ def _kept(settings: BowtieSettings, pieces: Pieces, name: str) -> Any:
         **({"total": {"histories": s.histories, "seed": s.seed}} if s.histories else {}),
     }
 
-    def compute() -> Any:
+    def compute() -> object:
         if kind == "noise":
             scanners, seeds = (
                 wide_scanners(s.views, s.detector),
@@ -267,7 +275,7 @@ def wide_scanners(views: int, detector: str = "eid") -> dict[str, Scanner]:
     pitch = presets.EID_PITCH_MM if integrating else presets.PCCT_PITCH_MM
     geometry = scanners["large"].geometry
     columns = 2 * math.ceil(HALF_FAN_RAD * geometry.sdd / pitch[1])
-    changes: dict[str, Any] = {"geometry": replace(geometry, columns=columns, pitch=pitch)}
+    changes: dict[str, object] = {"geometry": replace(geometry, columns=columns, pitch=pitch)}
     if integrating:
         changes["detector"] = Scintillator(electronic_noise_kev=0.0)
     return {b: s.replace(**changes) for b, s in scanners.items()}
@@ -319,7 +327,9 @@ def _radius(grid: VolumeGrid) -> Floats:
     return np.asarray(np.hypot(x, y))
 
 
-def radial_profile(image: Any, grid: VolumeGrid, radius: float, step_mm: float = 5.0) -> Floats:
+def radial_profile(
+    image: ArrayLike, grid: VolumeGrid, radius: float, step_mm: float = 5.0
+) -> Floats:
     """Means over rings of ``step_mm`` about the isocentre out to ``radius``, ``(rings, 2)`` of
     radius and mean."""
     ring = (_radius(grid) / step_mm).astype(np.int64).ravel()
@@ -348,7 +358,7 @@ def noise(
     exposure_s: float,
     kernel: str,
     seeds: range,
-) -> tuple[dict[str, Any], Floats]:
+) -> tuple[dict[str, object], Floats]:
     """Mean and noise of the regions of one of :func:`phantoms` with both bowties, a realisation for
     each seed.
 
@@ -359,7 +369,7 @@ def noise(
     scans, grid = slice_scans(scene, scanners), phantom_grid(name, PIXEL_MM)
     clean = np.stack([slice_image(scan, grid, kernel) for scan in scans.values()])
     r = _radius(grid)
-    regions: dict[str, Any] = {"heart": r < HEART_DISC_MM}
+    regions: dict[str, Bools] = {"heart": r < HEART_DISC_MM}
     if name == "ctdi":
         regions = {
             region: (r >= low) & (r < high) for region, (low, high) in CTDI_REGIONS_MM.items()
@@ -375,7 +385,7 @@ def noise(
         rings.append([radial_profile(e**2, grid, 155.0) for e in error])
     # Expected, of the darkest reading.
     quanta = {b: s.counts if s.quantum is None else s.counts / s.quantum for b, s in scans.items()}
-    found: dict[str, Any] = {
+    found: dict[str, object] = {
         "quanta_per_reading": {b: float(q.min()) * exposure_s for b, q in quanta.items()}
     }
     variances = np.array(squares)  # (realisations, regions, bowties)
@@ -461,18 +471,18 @@ def ratios(doses: dict[str, CtdiDose]) -> dict[str, float]:
     return {name: getattr(roi, of) / getattr(large, of) for name, of in figures.items()}
 
 
-def transmission(scanners: dict[str, Scanner]) -> dict[str, Any]:
+def transmission(scanners: dict[str, Scanner]) -> dict[str, object]:
     """Share of the energy that each bowtie lets through, relative to no bowtie, and thickness,
     over the fan."""
     gamma = np.linspace(0.0, 0.32, 161)
     sod = scanners["large"].geometry.sod
-    result: dict[str, Any] = {
+    result: dict[str, object] = {
         "fan_angle_deg": np.degrees(gamma),
         "offset_at_isocentre_mm": sod * np.sin(gamma),
     }
     for name, scanner in scanners.items():
         spectrum = scanner.source.spectrum(scanner.energy_bin_kev)
-        slab: Any = sum(
+        slab: Floats = sum(
             (m.attenuation(spectrum.energies) * t for m, t in scanner.filters), np.zeros(1)
         )
         energy = (
@@ -494,7 +504,7 @@ def transmission(scanners: dict[str, Scanner]) -> dict[str, Any]:
 
 def _combined(
     s: BowtieSettings, saved: dict[str, float], folder: Path | None, progress: Progress
-) -> list[dict[str, Any]]:
+) -> list[dict[str, object]]:
     """Scan, reconstruct, measure; ``saved``: kind of dose → factor that the ROI bowtie saves at
     equal exposure.
 
@@ -533,10 +543,13 @@ def _combined(
             (r for r in found.records if wanted.items() <= r.items()), dict.fromkeys(_KEYS, 0.0)
         )
 
-    results: list[dict[str, Any]] = []
+    results: list[dict[str, object]] = []
     for dose in s.plaque_doses:
         slope = record(large, "mbir", dose, "slope")
-        row: dict[str, Any] = {"exposure_s": dose, "mbir_contrast_slope": [slope[k] for k in _KEYS]}
+        row: dict[str, object] = {
+            "exposure_s": dose,
+            "mbir_contrast_slope": [slope[k] for k in _KEYS],
+        }
         for figure, (name, power, saving) in _RECORDS.items():
             with_roi, without = (
                 record(task, "fbp:soft", dose, name)["value"] for task in (roi, large)
@@ -612,7 +625,7 @@ def checks(data: dict[str, Any]) -> list[Check]:
 
 
 def _picture(
-    ax: Any, image: Any, grid: VolumeGrid, title: str, cmap: str, low: float, high: float
+    ax: Axes, image: ArrayLike, grid: VolumeGrid, title: str, cmap: str, low: float, high: float
 ) -> None:
     (y, x), (h, w) = grid.center[-2:], grid.extent[-2:]
     extent = (x - w / 2, x + w / 2, y - h / 2, y + h / 2)
@@ -638,7 +651,7 @@ def _picture(
     ax.figure.colorbar(shown, ax=ax, shrink=0.75, pad=0.01).ax.tick_params(labelsize=6)
 
 
-def _curves(ax: Any, title: str, label: str, x: Any, curves: dict[str, Any]) -> None:
+def _curves(ax: Axes, title: str, label: str, x: ArrayLike, curves: dict[str, ArrayLike]) -> None:
     for bowtie, colour in _COLOURS.items():
         ax.plot(x, curves[bowtie], color=colour, label=bowtie)
     ax.axvline(_ROI_RADIUS_MM, color="grey", linewidth=0.7, linestyle=":")
@@ -648,7 +661,7 @@ def _curves(ax: Any, title: str, label: str, x: Any, curves: dict[str, Any]) -> 
     ax.tick_params(labelsize=6)
 
 
-def figures(measured: Measured) -> dict[str, Any]:
+def figures(measured: Measured) -> dict[str, Figure]:
     """Bowties, dose maps and their ratios, noise with and without the ROI bowtie."""
     from matplotlib.figure import Figure
 

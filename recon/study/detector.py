@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -25,6 +25,10 @@ from torchpcct.scanner.pileup import recorded_rates
 from torchpcct.scanner.silicon_transport import Stack, efficiency, follow
 from torchpcct.scene.materials import PLAQUE_MATERIALS, material
 from torchpcct.validate import numbers
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 Floats = NDArray[np.float64]
 
@@ -73,6 +77,9 @@ class DetectorSettings(StudySettings):
         numbers("charge_sharing", self.charge_sharing, positive=True, high=1.0)
 
 
+T = TypeVar("T")
+
+
 def measure(
     settings: DetectorSettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
@@ -80,7 +87,7 @@ def measure(
     s, rng = settings, np.random.default_rng(settings.seed)
     pieces = Pieces(folder, settings)
 
-    def followed(name: str, compute: Callable[[], Any]) -> Any:
+    def followed(name: str, compute: Callable[[], T]) -> T:
         """A piece that draws photons; the next one draws on where it ended."""
         found, after = pieces(name, lambda: (compute(), rng.bit_generator.state))
         rng.bit_generator.state = after
@@ -111,7 +118,7 @@ def measure(
     return Measured(s, data)
 
 
-def _pile_up(settings: DetectorSettings, pieces: Pieces, dead_time_ns: float) -> Any:
+def _pile_up(settings: DetectorSettings, pieces: Pieces, dead_time_ns: float) -> dict[str, object]:
     return pieces(f"pile_up_{dead_time_ns:g}", partial(pile_up, dead_time_ns))
 
 
@@ -146,7 +153,7 @@ def cases() -> list[DetectorInBeam]:
     ]
 
 
-def efficiencies(case: DetectorInBeam, photons: int, rng: np.random.Generator) -> dict[str, Any]:
+def efficiencies(case: DetectorInBeam, photons: int, rng: np.random.Generator) -> dict[str, object]:
     """One-interaction share, and DQE of counts by following photons, against the lowest
     threshold."""
     d = replace(case.detector, fill_factor=1.0 - case.stack.foil_mm / case.stack.sheet_pitch_mm)
@@ -173,7 +180,7 @@ def efficiencies(case: DetectorInBeam, photons: int, rng: np.random.Generator) -
     return {"case": case.name, "rows": rows}
 
 
-def at_energy(energy: float, photons: int, rng: np.random.Generator) -> dict[str, Any]:
+def at_energy(energy: float, photons: int, rng: np.random.Generator) -> dict[str, float]:
     """The same of photons of one energy in keV, at the detector's own threshold."""
     d = SiliconDetector()
     k = follow(d, [energy], [1.0], photons, rng).counts(d.thresholds_kev[0], d.sigma_kev, rng)
@@ -190,7 +197,7 @@ def at_energy(energy: float, photons: int, rng: np.random.Generator) -> dict[str
     }
 
 
-def repeated_counts_hu(rows: list[dict[str, Any]]) -> dict[str, float]:
+def repeated_counts_hu(rows: list[dict[str, float]]) -> dict[str, float]:
     """Shifts of the plaque's CT numbers by the weight that repeated counts, see
     :func:`at_energy`, give to energies."""
     energies, beam = beam_behind(presets.pcct())
@@ -224,7 +231,7 @@ def hu_shift(energies: Floats, before: Floats, after: Floats) -> dict[str, float
     }
 
 
-def counts() -> list[dict[str, Any]]:
+def counts() -> list[dict[str, object]]:
     """Photons that reach and count in the central cell, in air and behind the patient."""
     scanner = presets.pcct()
     load, area = scanner.mas_per_view(EXPOSURE_S), float(np.prod(scanner.geometry.pitch))
@@ -244,14 +251,14 @@ def counts() -> list[dict[str, Any]]:
     return rows
 
 
-def _mean_energy(thresholds: Any, binned: Any) -> float:
+def _mean_energy(thresholds: Any, binned: Floats) -> float:
     """Mean energy of the bins (their middle; the open one by the width of its neighbour),
     weighted by counts."""
     edges = np.append(thresholds, 2 * thresholds[-1] - thresholds[-2])
     return float((edges[:-1] + edges[1:]) @ binned / 2 / binned.sum())
 
 
-def charge_sharing(share: float, photons: int, rng: np.random.Generator) -> dict[str, Any]:
+def charge_sharing(share: float, photons: int, rng: np.random.Generator) -> dict[str, object]:
     """Counts (both parts may count), photons (or none), energies, CT numbers and efficiency if
     pulses split between two strips."""
     energies, beam = beam_behind(presets.pcct())
@@ -281,9 +288,9 @@ def charge_sharing(share: float, photons: int, rng: np.random.Generator) -> dict
     }
 
 
-def pile_up(dead_ns: float) -> dict[str, Any]:
+def pile_up(dead_ns: float) -> dict[str, object]:
     """Losses, spectra and CT numbers with a dead time, in air and behind the body."""
-    result: dict[str, Any] = {"dead_time_ns": dead_ns, "merge_ns": dead_ns / 2}
+    result: dict[str, object] = {"dead_time_ns": dead_ns, "merge_ns": dead_ns / 2}
     spectral = SiliconDetector("spectral", dead_time_ns=dead_ns, merge_ns=dead_ns / 2)
     free, scanner = (
         presets.pcct(),
@@ -363,7 +370,7 @@ def checks(data: dict[str, Any]) -> list[Check]:
     ]
 
 
-def figures(measured: Measured) -> dict[str, Any]:
+def figures(measured: Measured) -> dict[str, Figure]:
     """Efficiency against threshold and energy, and recorded over true counts against the
     thickness of fat."""
     from matplotlib.figure import Figure

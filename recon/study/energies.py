@@ -12,7 +12,7 @@ contrast over variance with that of the plain sum.
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -37,6 +37,12 @@ from torchpcct.spectral import (
     weighting_gain,
 )
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from torchpcct.typing import Floats
+
+
 PAIRS = (("lumen", "fibrous"), ("fibrous", "patient"), ("core", "fibrous"))
 """Bodies of the plaque scene whose contrasts are looked at."""
 
@@ -52,12 +58,12 @@ _PURE = 0.99
 
 def energy_rows(
     task: Task,
-    pairs: Any = PAIRS,
+    pairs: Sequence[tuple[str, str]] = PAIRS,
     *,
     views: int = VIEWS,
     kernel: str = KERNEL,
     progress: Progress = silent,
-) -> list[dict[str, Any]]:
+) -> list[dict[str, object]]:
     """Dose factors of contrasts between tissues, over the plain sum of the counts.
 
     Args:
@@ -138,7 +144,7 @@ def energy_rows(
     return rows
 
 
-def _differences(task: Task, pairs: Any) -> list[Tensor]:
+def _differences(task: Task, pairs: Sequence[tuple[str, str]]) -> list[Tensor]:
     """For each pair weights ``grid.shape``: mean over the first body's voxels less that over the
     second one's."""
     shares = dict(zip(task.scene.names, task.scene.volume_fractions(task.grid, 16), strict=True))
@@ -155,7 +161,7 @@ def _differences(task: Task, pairs: Any) -> list[Tensor]:
     return found
 
 
-def _per_mm(change: Tensor, path: Tensor) -> Any:
+def _per_mm(change: Tensor, path: Tensor) -> Floats:
     """Least squares for what readings ``(..., views, rows, columns)`` change by per mm of path."""
     p = path.double()
     return ((change.double() * p).sum((-3, -2, -1)) / p.square().sum()).numpy()

@@ -4,13 +4,22 @@ outlines."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from recon.study.paper.plaque_scan import PlaqueImage
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.placement import RoiPair
 from torchpcct.metrics.roi import PROTOCOL_PIXEL_MM
 from torchpcct.viz import Panel
+
+if TYPE_CHECKING:
+    import numpy as np
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+    from torch import Tensor
+
+    from torchpcct.typing import Bools, Reals
+
 
 _SHOWN_PX = 160
 """Edge of the middle of an image of the protocol's pixels that shows the vessel and its
@@ -26,13 +35,16 @@ def extent(
     return (-h, h, -v, v)
 
 
-def roi_outlines(rois: RoiPair) -> tuple[tuple[Any, str], ...]:
+def roi_outlines(rois: RoiPair) -> tuple[tuple[Bools, str], ...]:
     """Outlines of the two ROIs of the CNR for a panel: the core's blue, the fibrous tissue's
     red."""
     return (rois.foreground[0], "deepskyblue"), (rois.background[0], "tomato")
 
 
-def _middle(image: Any) -> Any:
+Image = TypeVar("Image", "Tensor", "Reals", "Bools")
+
+
+def _middle(image: Image) -> Image:
     rows, columns = ((n - _SHOWN_PX) // 2 for n in image.shape)
     return image[rows : rows + _SHOWN_PX, columns : columns + _SHOWN_PX]
 
@@ -55,7 +67,7 @@ def plaque_panel(found: PlaqueImage, title: str = "", caption: str = "") -> Pane
     return middle_panel(found.image, title, outlines=outlines, caption=caption)
 
 
-def curve_axes(x_label: str, y_labels: Sequence[str]) -> tuple[Any, Any]:
+def curve_axes(x_label: str, y_labels: Sequence[str]) -> tuple[Figure, NDArray[np.object_]]:
     """A matplotlib figure of curves over one x, side by side, and its axes: one for every label."""
     from matplotlib.figure import Figure
 

@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from torch import Tensor
@@ -51,6 +51,12 @@ from torchpcct.scene.motion import SinusoidalMotion
 from torchpcct.scene.plaque import Plaque, plaque_scene
 from torchpcct.validate import number
 from torchpcct.viz import WINDOW_HU, Panel, panels
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from torchpcct.typing import Floats
+
 
 METHODS = {"fbp": "FBP", "pwls": "q-GGMRF PWLS", "mbir": "MBIR (learned prior)"}
 """Methods and their names in tables."""
@@ -105,7 +111,7 @@ class MotionSettings(StudySettings):
     methods: tuple[str, ...] = tuple(METHODS)
 
     # An eighth of the views, four residual motions, one error of the estimate, no PWLS.
-    QUICK: ClassVar[dict[str, Any]] = {
+    QUICK: ClassVar[dict[str, object]] = {
         "thinning": 8,
         "fractions": (0.1, 0.4, 0.6, 1.0),
         "errors": (0.10,),
@@ -299,7 +305,7 @@ def compensate(
     """
     grid = reference.grid
     path = view_motion(s.motion.scaled(s.worst), moving.geometry, s.rotation_s)
-    estimates: dict[float | None, Any] = {None: None}
+    estimates: dict[float | None, Floats | None] = {None: None}
     estimates |= {e: (1.0 - e) * path for e in (0.0, *s.errors)}
     problems: dict[float | None, InsetProblem] = {}
     if set(s.methods) - {"fbp"}:
@@ -456,7 +462,7 @@ def checks(data: dict[str, Any]) -> list[Check]:
     return checks
 
 
-def figures(measured: Measured) -> dict[str, Any]:
+def figures(measured: Measured) -> dict[str, Figure]:
     """Images with error maps, and measures against the motion."""
     s, m = measured.settings, measured.seen
     return {"motion_images.png": _images(m), "motion.png": _curves(s, m)}
@@ -468,7 +474,7 @@ def _error_map(found: PlaqueImage, rest: PlaqueImage) -> Panel:
     return middle_panel((found.image - rest.image) * (width / _ERROR_WIDTH_HU) + center)
 
 
-def _images(m: Found) -> Any:
+def _images(m: Found) -> Figure:
     """PCCT and EID-CT with residual motion and their error maps; then the compensated images."""
     rows: list[list[Panel]] = []
     labels = []
@@ -513,7 +519,7 @@ def _images(m: Found) -> Any:
     return figure
 
 
-def _curves(s: MotionSettings, m: Found) -> Any:
+def _curves(s: MotionSettings, m: Found) -> Figure:
     """NRMSE, lumen area and depth of the core's basin against residual motion, uncompensated and
     compensated."""
     figure, axes = curve_axes(

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -47,6 +47,11 @@ from torchpcct.scan import Scan
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene
 from torchpcct.viz import Panel, panels
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike
+
 
 Floats = NDArray[np.float64]
 
@@ -85,7 +90,7 @@ class NoiseSettings(StudySettings):
     experiments: int = 20_000
 
     # An eighth of the views, two kernels, three voxel sizes, two doses.
-    QUICK: ClassVar[dict[str, Any]] = {
+    QUICK: ClassVar[dict[str, object]] = {
         "realizations": 40,
         "views": 246,
         "kernels": ("soft", "standard"),
@@ -131,11 +136,11 @@ class Moments:
     """
 
     scanned: PlaqueScan
-    expected: Any
-    covariance: Any
-    means: dict[float, Any]
-    variances: dict[float, Any]
-    images: dict[tuple[str, float], Any] = field(default_factory=dict)
+    expected: Floats
+    covariance: Floats
+    means: dict[float, Floats]
+    variances: dict[float, Floats]
+    images: dict[tuple[str, float], Tensor] = field(default_factory=dict)
 
     def exact(self, exposure_s: float) -> RoiStatistics:
         """The truth at an exposure."""
@@ -202,20 +207,20 @@ def _realisations(
     settings: NoiseSettings,
     near: Scan,
     matrix: Tensor,
-    expected: Any,
+    expected: Floats,
     pieces: Pieces,
     progress: Progress,
-) -> tuple[dict[float, Any], dict[float, Any]]:
+) -> tuple[dict[float, Floats], dict[float, Floats]]:
     """``means`` and ``variances`` of :class:`Moments`, from the noise-free readings that the ROIs
     see and the adjoint vectors, a row of ``matrix`` for every ROI mean."""
     quiet = near.line_integrals().flatten()
-    means: dict[float, Any] = {}
-    variances: dict[float, Any] = {}
+    means: dict[float, Floats] = {}
+    variances: dict[float, Floats] = {}
     total = len(settings.doses) * settings.realizations
     n = settings.realizations
     for exposure in settings.doses.values():
 
-        def block(first: int, exposure: float = exposure) -> tuple[Any, Any]:
+        def block(first: int, exposure: float = exposure) -> tuple[Floats, Floats]:
             values, squares = [], np.zeros(matrix.shape[0])
             for i in range(first, min(first + _BLOCK, n)):
                 deviation = (
@@ -242,8 +247,8 @@ def _realisations(
 
 
 def _reconstructions(
-    settings: NoiseSettings, scanned: PlaqueScan, means: Any, sd: Any, progress: Progress
-) -> tuple[dict[tuple[str, float], Any], dict[str, Any]]:
+    settings: NoiseSettings, scanned: PlaqueScan, means: Floats, sd: Floats, progress: Progress
+) -> tuple[dict[tuple[str, float], Tensor], dict[str, float]]:
     """The first realisation's images at the tables' dose, and how far FBP in full is from
     ``means`` ``(n, S, 2)``."""
     images: list[Tensor] = []
@@ -263,12 +268,12 @@ def _reconstructions(
     }
 
 
-def _dose_table(s: NoiseSettings, m: Moments, exposure: float) -> list[dict[str, Any]]:
+def _dose_table(s: NoiseSettings, m: Moments, exposure: float) -> list[dict[str, object]]:
     """One row per setting: exact, by all realisations, by the first ten, and the paper's
     entries."""
     exact, values = m.exact(exposure), m.means[exposure]
 
-    def sampled(runs: Any, i: int, **more: Any) -> dict[str, Any]:
+    def sampled(runs: Floats, i: int, **more: Any) -> dict[str, Any]:
         table = measured_table(runs[:, i : i + 1])
         interval = list(cnr_interval(runs[:, i, 0], runs[:, i, 1]))
         return {
@@ -305,7 +310,7 @@ def _dose_table(s: NoiseSettings, m: Moments, exposure: float) -> list[dict[str,
     return rows
 
 
-def _against_dose(s: NoiseSettings, m: Moments) -> dict[str, Any]:
+def _against_dose(s: NoiseSettings, m: Moments) -> dict[str, object]:
     """Slope of log σ of the ROI means against log exposure, −½ for counting noise, and how exact
     the noise is.
 
@@ -326,7 +331,7 @@ def _against_dose(s: NoiseSettings, m: Moments) -> dict[str, Any]:
     }
 
 
-def _ten_run_experiments(s: NoiseSettings, m: Moments, exposure: float) -> dict[str, Any]:
+def _ten_run_experiments(s: NoiseSettings, m: Moments, exposure: float) -> dict[str, object]:
     """How often each setting has the highest CNR in experiments of ten realisations."""
     shared = few_run_tables(m.expected, m.covariance / exposure, s.experiments, s.seed)
     winners = np.bincount(shared.cnr.argmax(-1), minlength=len(s.axes)) / s.experiments
@@ -336,7 +341,7 @@ def _ten_run_experiments(s: NoiseSettings, m: Moments, exposure: float) -> dict[
     }
 
 
-def _pairs(s: NoiseSettings, m: Moments, exposure: float) -> dict[str, Any]:
+def _pairs(s: NoiseSettings, m: Moments, exposure: float) -> dict[str, object]:
     """CNR differences: the paper's best against all others, and how many of all pairs are
     established."""
     axes, exact = s.axes, m.exact(exposure)
@@ -396,13 +401,13 @@ class RoiStatistics:
         )
 
 
-def measured_table(means: Any) -> RoiStatistics:
+def measured_table(means: ArrayLike) -> RoiStatistics:
     """From realisations: ``(..., n, settings, 2)`` ROI means."""
     values = np.asarray(means, dtype=np.float64)
     return RoiStatistics(values.mean(-3), values.std(-3, ddof=1))
 
 
-def few_run_tables(mean: Any, covariance: Any, draws: int, seed: int) -> RoiStatistics:
+def few_run_tables(mean: ArrayLike, covariance: Any, draws: int, seed: int) -> RoiStatistics:
     """Tables that so many experiments of ten realisations would report, whose ROI means
     ``(settings, 2)`` HU have this covariance ``(2 · settings, 2 · settings)`` HU²."""
     rng, parts = np.random.default_rng(seed), []
@@ -462,7 +467,7 @@ class Pair:
 
 
 def pair_differences(
-    means: Any,
+    means: ArrayLike,
     exact: RoiStatistics,
     pairs: Sequence[tuple[int, int]],
     *,
@@ -518,7 +523,7 @@ def checks(data: dict[str, Any]) -> list[Check]:
     ]
 
 
-def published(table: Any, kernel: str, voxel_mm: float, exposure_s: float) -> Any:
+def published(table: Floats, kernel: str, voxel_mm: float, exposure_s: float) -> Any:
     """The entry of one of the paper's tables for FBP at this setting, or None."""
     if (
         exposure_s != paper.TABLE_EXPOSURE_S
@@ -530,7 +535,7 @@ def published(table: Any, kernel: str, voxel_mm: float, exposure_s: float) -> An
 
 
 def table_checks(
-    kernel: str, voxel_mm: float, means_hu: Sequence[float], covariance_hu2: Any
+    kernel: str, voxel_mm: float, means_hu: Sequence[float], covariance_hu2: ArrayLike
 ) -> list[Check]:
     """The paper's tables against the exact expectation and covariance of the core's and the fibrous
     ROI mean at their exposure: no sampling error.
@@ -567,7 +572,7 @@ def table_checks(
     return checks
 
 
-def figures(measured: Measured) -> dict[str, Any]:
+def figures(measured: Measured) -> dict[str, Figure]:
     """Images of every setting, and CNRs with their uncertainty, at the tables' dose."""
     s, m = measured.settings, measured.seen
     name = next(name for name, dose in s.doses.items() if dose == s.table_exposure_s)
@@ -577,7 +582,7 @@ def figures(measured: Measured) -> dict[str, Any]:
     }
 
 
-def _images(s: NoiseSettings, m: Moments) -> Any:
+def _images(s: NoiseSettings, m: Moments) -> Figure:
     """One realisation at the tables' dose: kernels down, voxel sizes across."""
     rois = m.scanned.rois
     rows = []
@@ -599,7 +604,7 @@ def _images(s: NoiseSettings, m: Moments) -> Any:
     return figure
 
 
-def _cnrs(s: NoiseSettings, rows: list[dict[str, Any]]) -> Any:
+def _cnrs(s: NoiseSettings, rows: list[dict[str, Any]]) -> Figure:
     """CNR of every setting: exact, n realisations with interval, range of 10-run experiments,
     the paper's."""
     from matplotlib.figure import Figure

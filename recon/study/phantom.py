@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
@@ -24,6 +24,12 @@ from torchpcct.scene.materials import MATERIALS
 from torchpcct.scene.plaque import PATIENT_DIAMETER, Plaque, plaque_scene
 from torchpcct.validate import number, numbers
 from torchpcct.viz import Panel, panels
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from torchpcct.typing import Floats, Ints
+
 
 TRANSMITTED = "100 kVp behind 24 cm fat"
 """Spectrum behind the patient for which CT numbers are checked."""
@@ -98,7 +104,7 @@ def measure(
     return Measured(settings, data)
 
 
-def compositions() -> list[dict[str, Any]]:
+def compositions() -> list[dict[str, object]]:
     """Per material: density, mass fractions, and their largest difference to the paper's table.
 
     The library's own fractions are the paper's table, normalised: agreement says that it was copied
@@ -129,7 +135,9 @@ def ct_numbers(energies_kev: tuple[float, ...]) -> dict[str, dict[str, float]]:
     scanner's filters, the large bowtie's middle, 24 cm of fat), and of the signals that PCCT and
     EID-CT make of these.
     """
-    spectra: dict[str, tuple[Any, Any]] = {f"{e:g} keV": (e, 1.0) for e in energies_kev}
+    spectra: dict[str, tuple[float | Floats, float | Floats]] = {
+        f"{e:g} keV": (e, 1.0) for e in energies_kev
+    }
     patient = {MATERIALS["pericoronary_fat"]: PATIENT_DIAMETER}
     pcct, eid = presets.pcct(), presets.eid()
     middle = pcct.geometry.columns // 2
@@ -148,7 +156,7 @@ def ct_numbers(energies_kev: tuple[float, ...]) -> dict[str, dict[str, float]]:
     }
 
 
-def _nearest(hu: dict[str, dict[str, float]], published: dict[str, float]) -> dict[str, Any]:
+def _nearest(hu: dict[str, dict[str, float]], published: dict[str, float]) -> dict[str, object]:
     """The spectrum whose CT numbers come nearest to the published ones, and the largest
     difference."""
     miss = {
@@ -243,7 +251,7 @@ def raster_lengths(
 
 def _raster(
     scene: Scene, plaque: Plaque, center: Any, half: Any, voxel_mm: float
-) -> tuple[Any, Any]:
+) -> tuple[Ints, Floats]:
     """Labels ``(z, y, x)`` of a box in the plaque's frame, and its points in the scanner's."""
     n = [max(1, 2 * math.floor(h / voxel_mm) + 1) for h in half][::-1]
     z, y, x = VolumeGrid(tuple(n), voxel_mm, tuple(center)[::-1]).axes
@@ -288,7 +296,7 @@ def checks(data: dict[str, Any]) -> list[Check]:
     return found
 
 
-def figures(measured: Measured) -> dict[str, Any]:
+def figures(measured: Measured) -> dict[str, Figure]:
     """Axial section through the plaque's middle, and the section along the vessel through wall,
     core and lumen."""
     scene, plaque = plaque_scene()
@@ -297,7 +305,7 @@ def figures(measured: Measured) -> dict[str, Any]:
     half = plaque.vessel_length / 2.0
     along = np.arange(-half, half, _PIXEL_MM) + 0.5 * _PIXEL_MM
 
-    def panel(x: Any, y: Any, z: Any, vertical: float, title: str) -> Panel:
+    def panel(x: Floats, y: Floats, z: Floats, vertical: float, title: str) -> Panel:
         points = plaque.to_scanner(np.stack(np.broadcast_arrays(x, y, z), -1))
         return Panel(
             values[scene.labels(points)], (-_HALF_MM, _HALF_MM, -vertical, vertical), title

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -28,6 +28,11 @@ from torchpcct.scan import Scan
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene
 from torchpcct.validate import number, numbers
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
 
 _EDGE_MM = 9.2
 """Of the inset about the plaque, seen in every view."""
@@ -72,7 +77,7 @@ class RecoverySettings(StudySettings):
     voxel_mm: float = 0.2
 
     # An eighth of the views, one realisation, one ball.
-    QUICK: ClassVar[Mapping[str, Any]] = {
+    QUICK: ClassVar[Mapping[str, object]] = {
         "views": 246,
         "n": 1,
         "balls": ((1.0, 100.0),),
@@ -106,7 +111,7 @@ def measure(
     jobs = [(e, seed) for e in s.exposures_s for seed in range(s.seed, s.seed + s.n)]
     pieces.ahead(_realisation, *jobs)
     clean = _clean(s, pieces)
-    found: dict[tuple[float, int], list[dict[str, Any]]] = {}
+    found: dict[tuple[float, int], list[dict[str, object]]] = {}
     for k, job in enumerate(jobs):
         progress("realisations", k / len(jobs))
         found[job] = _realisation(s, pieces, *job, clean=clean)
@@ -173,9 +178,9 @@ def _realisation(
     exposure_s: float,
     seed: int,
     clean: Scan | None = None,
-) -> list[dict[str, Any]]:
+) -> list[dict[str, object]]:
     """All balls and methods in one noise realisation."""
-    rows: list[dict[str, Any]] = pieces(
+    rows: list[dict[str, object]] = pieces(
         f"{exposure_s:g}_{seed}", partial(_rows, settings, pieces, exposure_s, seed, clean)
     )
     return rows
@@ -183,7 +188,7 @@ def _realisation(
 
 def _rows(
     s: RecoverySettings, pieces: Pieces, exposure_s: float, seed: int, clean: Scan | None
-) -> list[dict[str, Any]]:
+) -> list[dict[str, object]]:
     scan = clean or _clean(s, pieces)
     balls = [InsertedBall(*ball) for ball in s.balls]
     found = contrast_recovery(
@@ -197,7 +202,7 @@ def _rows(
     return [row.as_dict() for row in found]
 
 
-def _pooled(exposure_s: float, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _pooled(exposure_s: float, rows: Sequence[Mapping[str, Any]]) -> dict[str, object]:
     """One ball and method over the realisations."""
     first = rows[0]
     together = ContrastRecovery(
@@ -216,14 +221,16 @@ def _pooled(exposure_s: float, rows: Sequence[Mapping[str, Any]]) -> dict[str, A
     }
 
 
-def figures(measured: Measured) -> dict[str, Any]:
+def figures(measured: Measured) -> dict[str, Figure]:
     """Contrast recovery by ball, a colour for each method, an exposure in each panel."""
     from matplotlib.figure import Figure
 
     s: RecoverySettings = measured.settings
     rows = measured.data["rows"]
     figure = Figure((5.4 * len(s.exposures_s), 4.2), dpi=110, layout="constrained")
-    panels: Any = figure.subplots(1, len(s.exposures_s), sharey=True, squeeze=False)[0]
+    panels: NDArray[np.object_] = figure.subplots(
+        1, len(s.exposures_s), sharey=True, squeeze=False
+    )[0]
     width = 0.8 / len(s.methods)
     for axes, exposure in zip(panels, s.exposures_s, strict=True):
         at = np.arange(len(s.balls))

@@ -10,12 +10,14 @@ import importlib
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from recon.study.names import check_setting, setting_names, settings_name
 from torchpcct.validate import choice
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     from recon.study.report import Report
     from recon.study.study import Measured, Progress, StudySettings
 
@@ -69,7 +71,7 @@ def folder(name: str) -> str:
     return choice("study", _FORMER.get(name, name), STUDIES).replace("-", "_")
 
 
-def part(name: str) -> Any:
+def part(name: str) -> ModuleType:
     """The module of a study, with the names that :mod:`recon.study.study` lists.
 
     Raises:
@@ -90,7 +92,7 @@ def settings_class(name: str) -> type[StudySettings]:
 
 def build_settings(
     name: str, *, quick: bool = False, seed: int | None = None, changes: Sequence[str] = ()
-) -> Any:
+) -> StudySettings:
     """Settings of a study from command-line values.
 
     Args:
@@ -106,7 +108,7 @@ def build_settings(
         TypeError: a value of a wrong type.
     """
     known = setting_names(folder(name))
-    values: dict[str, Any] = {} if seed is None or "seed" not in known else {"seed": seed}
+    values: dict[str, object] = {} if seed is None or "seed" not in known else {"seed": seed}
     for change in changes:
         key, text = check_setting(folder(name), change)
         try:
@@ -117,14 +119,20 @@ def build_settings(
 
 
 def run(
-    name: str, settings: Any, progress: Progress | None = None, pieces: str | Path | None = None
+    name: str,
+    settings: StudySettings,
+    progress: Progress | None = None,
+    pieces: str | Path | None = None,
 ) -> Report:
     """Measure a study and build its report, which is not saved; see :func:`measured`."""
     return report_of(name, measured(name, settings, progress, pieces))
 
 
 def measured(
-    name: str, settings: Any, progress: Progress | None = None, pieces: str | Path | None = None
+    name: str,
+    settings: StudySettings,
+    progress: Progress | None = None,
+    pieces: str | Path | None = None,
 ) -> Measured:
     """Measure a study.
 

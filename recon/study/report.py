@@ -16,11 +16,17 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from recon.evaluate.report import filled, write_report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from torchpcct.typing import Json
+
 
 TEMPLATES = Path(__file__).parent / "templates"
 """Of the studies' texts."""
@@ -54,7 +60,7 @@ class Check:
         """The check with ``cause`` as its note, where it is outside."""
         return self if self.ok or not cause else replace(self, note=cause)
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, float | str | bool | None]:
         """JSON values, ``ok`` among them; open ends are None."""
         ends = {
             k: v if math.isfinite(v) else None for k, v in (("low", self.low), ("high", self.high))
@@ -67,7 +73,7 @@ def around(name: str, ours: float, paper: float, tolerance: float, note: str = "
     return Check(name, ours, paper, paper - tolerance, paper + tolerance, note)
 
 
-def render(name: str, data: Mapping[str, Any]) -> str:
+def render(name: str, data: Mapping[str, object]) -> str:
     """The text of a report, or another text that a study tells.
 
     Args:
@@ -116,7 +122,7 @@ def _padded(table: str) -> str:
     )
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Json:
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, np.generic):
@@ -137,7 +143,7 @@ class Report:
 
     name: str
     data: dict[str, Any]
-    figures: dict[str, Any] = field(default_factory=dict)
+    figures: dict[str, Figure] = field(default_factory=dict)
     screen_template: str = ""
 
     @property

@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,11 @@ from torchpcct.scene import Body, EllipticCylinder, Scene
 from torchpcct.scene.plaque import PATIENT_DIAMETER, Plaque, plaque_scene
 from torchpcct.validate import number
 from torchpcct.viz import panels
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike
+
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 """Full width at half maximum of a Gaussian of unit standard deviation."""
@@ -92,7 +97,7 @@ class ResolutionSettings(StudySettings):
     exposure_s: float = paper.TABLE_EXPOSURE_S
 
     # An eighth of the views.
-    QUICK: ClassVar[dict[str, Any]] = {"thinning": 8}
+    QUICK: ClassVar[dict[str, object]] = {"thinning": 8}
 
     def __post_init__(self) -> None:
         self.check_whole(thinning=1)
@@ -151,7 +156,7 @@ def _image(
     settings: ResolutionSettings,
     pieces: Pieces,
     progress: Callable[[float], None],
-) -> tuple[Imaged, dict[str, Any]]:
+) -> tuple[Imaged, dict[str, object]]:
     """One scanner's image and its JSON values: what the two ROIs read, with and without a core;
     noise at the same fluence at the isocentre for all scanners; width of a point; and the blur
     series (EID-CT: without blur only)."""
@@ -323,7 +328,7 @@ def limits(series: list[PlaqueImage], tolerance: float) -> dict[str, Any]:
     }
 
 
-def crossing(x: Any, values: Any, limit: float) -> float:
+def crossing(x: ArrayLike, values: ArrayLike, limit: float) -> float:
     """First x at which ``values`` exceed ``limit``, by linear interpolation; NaN values count as
     exceeding, and the last x is returned where none does."""
     x, v = np.asarray(x, dtype=np.float64), np.asarray(values, dtype=np.float64)
@@ -424,7 +429,7 @@ def checks(data: dict[str, Any]) -> list[Check]:
     ]
 
 
-def figures(measured: Measured) -> dict[str, Any]:
+def figures(measured: Measured) -> dict[str, Figure]:
     """The images under blur, and what blur does to lumen, cap and core."""
     return {"resolution_images.png": _images(measured.seen), "resolution.png": _curves(measured)}
 
@@ -436,7 +441,7 @@ def _sagittal(s: Imaged) -> Tensor:
     return sample_axial(s.volume.double(), s.scanned.fine, cut)[:, 0]
 
 
-def _images(scanners: dict[str, Imaged]) -> Any:
+def _images(scanners: dict[str, Imaged]) -> Figure:
     """First row: both scanners; second: PCCT under blur with its segmentation; third: the same,
     along the vessel."""
     series = scanners["PCCT"].blurred
@@ -457,7 +462,7 @@ def _images(scanners: dict[str, Imaged]) -> Any:
     )
 
 
-def _curves(m: Measured) -> Any:
+def _curves(m: Measured) -> Figure:
     """Lumen area, cap thickness and depth of the core's basin against the blur."""
     figure, (lumen, cap, basin) = curve_axes(
         "σ of the blur, 0.035 mm pixels",

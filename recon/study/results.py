@@ -15,11 +15,15 @@ import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from recon.evaluate.report import filled
 from recon.mbir.shown import RECOVERY
 from recon.study import registry, report
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Json
+
 
 README_MARKS = ("<!-- results: rendered by torchpcct verify --write -->", "<!-- end of results -->")
 """Between them stands in README.md, and in the template, what both share."""
@@ -91,7 +95,7 @@ def render(root: Path) -> dict[str, str]:
 
 
 def differences(
-    committed: Any, again: Any, tolerance: float = 1e-3, place: str = ""
+    committed: Json, again: Json, tolerance: float = 1e-3, place: str = ""
 ) -> Iterator[str]:
     """Where a result that was computed again differs from the committed one.
 

@@ -90,10 +90,10 @@ class StudySettings:
         TypeError, ValueError: a value of the wrong kind, or out of range.
     """
 
-    QUICK: ClassVar[Mapping[str, Any]] = {}
+    QUICK: ClassVar[Mapping[str, object]] = {}
 
     @classmethod
-    def of(cls, values: Mapping[str, Any], quick: bool = False) -> Self:
+    def of(cls, values: Mapping[str, object], quick: bool = False) -> Self:
         """Settings from the values of a report or a command, whose lists are tuples here; what is
         no field is left out.
 
@@ -160,7 +160,7 @@ class Measured:
     seconds: dict[str, float] = field(default_factory=dict)
 
 
-def environment() -> dict[str, Any]:
+def environment() -> dict[str, str | int | None]:
     """Versions and machine that made a result."""
     import numba
     import scipy

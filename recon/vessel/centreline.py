@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,10 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from torchpcct.geometry import VolumeGrid
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 
 Floats = NDArray[np.float64]
 
@@ -70,7 +74,7 @@ class Centreline:
         )
 
     @cached_property
-    def _spline(self) -> Any:
+    def _spline(self) -> CubicSpline:
         return CubicSpline(self._at, self.points, bc_type="natural")
 
     @property
@@ -78,14 +82,14 @@ class Centreline:
         """mm."""
         return float(self._at[-1])
 
-    def point(self, s: Any) -> Floats:
+    def point(self, s: ArrayLike) -> Floats:
         """``(..., 3)`` z, y, x mm."""
         s = np.asarray(s, np.float64)
         inside = np.clip(s, 0.0, self.length)
         beyond: Floats = self._spline(inside) + (s - inside)[..., None] * self._spline(inside, 1)
         return beyond
 
-    def tangent(self, s: Any) -> Floats:
+    def tangent(self, s: ArrayLike) -> Floats:
         """``(..., 3)`` unit vectors."""
         t = self._spline(np.clip(s, 0.0, self.length), 1)
         return np.asarray(t / np.linalg.norm(t, axis=-1, keepdims=True))
@@ -111,7 +115,7 @@ class Centreline:
             normal[i + 1] = r if c2 < 1e-24 else r - 2 / c2 * (v2 @ r) * v2
         return s, x, normal
 
-    def across(self, s: Any) -> tuple[Floats, Floats]:
+    def across(self, s: ArrayLike) -> tuple[Floats, Floats]:
         """Two unit vectors across the line at s, ``(..., 3)`` each; θ grows from the first to
         the second."""
         at, _, normals = self._samples
@@ -148,7 +152,7 @@ class Centreline:
         )
 
     @cached_property
-    def _tree(self) -> Any:
+    def _tree(self) -> cKDTree:
         return cKDTree(self._samples[1])
 
 

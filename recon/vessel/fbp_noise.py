@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING
 
 from recon.analytic.exact_noise import roi_adjoints
 from recon.analytic.inset import InsetFbp
@@ -14,8 +14,13 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import RoiMean
 from torchpcct.scan import Scan
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
-def fbp_deviations(scan: Scan, grid: VolumeGrid, regions: Mapping[str, Any]) -> dict[str, float]:
+
+def fbp_deviations(
+    scan: Scan, grid: VolumeGrid, regions: Mapping[str, ArrayLike]
+) -> dict[str, float]:
     """Standard deviation in HU of soft FBP's mean over each region, and of the contrast, of the
     noise alone.
 

@@ -35,7 +35,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -218,16 +218,22 @@ def _without(found: Drawn, why: str) -> Drawn:
     )
 
 
+class _ImageContext(Protocol):
+    """What a forward pass leaves to the backward one."""
+
+    kept: tuple[LayerEstimate, float]
+
+
 class _LinearImage(torch.autograd.Function):
     """The image of an estimate, whose change with b is linear and symmetric."""
 
     @staticmethod
-    def forward(ctx: Any, b: Tensor, estimate: LayerEstimate, mu_per_hu: float) -> Tensor:
+    def forward(ctx: _ImageContext, b: Tensor, estimate: LayerEstimate, mu_per_hu: float) -> Tensor:
         ctx.kept = estimate, mu_per_hu
         return torch.from_numpy(estimate.image).to(b)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Any:
+    def backward(ctx: _ImageContext, grad: Tensor) -> tuple[Tensor, None, None]:
         estimate, mu_per_hu = ctx.kept
         with threadpool_limits(limits=1, user_api="blas"):
             change = estimate.change(grad.detach().double().numpy())

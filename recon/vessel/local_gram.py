@@ -17,7 +17,7 @@ from recon.vessel.kernels import gather_block, symmetric_step
 from torchpcct.threads import run
 from torchpcct.validate import shaped
 
-Floats = NDArray[np.floating[Any]]
+Floats = NDArray[np.floating]
 
 LARGEST = 1_500_000_000
 """Bytes that the blocks may take."""

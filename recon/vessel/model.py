@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -174,7 +174,7 @@ class Fit:
         return self.vessel.hessian(self.drawing, self.precision, self._seen)
 
     @cached_property
-    def factor(self) -> Any:
+    def factor(self) -> tuple[Floats, bool]:
         """Cholesky factor of the Hessian."""
         return cho_factor(self.hessian, lower=True)
 
@@ -223,6 +223,9 @@ def _behind(distance: Floats, variance: Floats) -> tuple[Floats, Floats]:
     return np.where(near | (t < 0.0), ndtr(-t), 0.0), near * np.exp(-0.5 * t * t) / (
         math.sqrt(2.0 * math.pi) * sd
     )
+
+
+T = TypeVar("T", bound=np.floating)
 
 
 class VesselModel:
@@ -339,7 +342,7 @@ class VesselModel:
 
     # -- drawing -----------------------------------------------------------------------------------
 
-    def as_projected(self, soft: Any) -> Any:
+    def as_projected(self, soft: NDArray[T]) -> NDArray[T]:
         """What the operator must be given of ``(n,)`` or ``(n, k)`` values that are drawn as
         softly as outlines."""
         return self._less(soft, EXCESS)
@@ -354,7 +357,7 @@ class VesselModel:
         out[tuple(self.index.T)] = values
         return out
 
-    def _less(self, soft: Any, excess: float) -> Any:
+    def _less(self, soft: NDArray[T], excess: float) -> NDArray[T]:
         columns = np.ascontiguousarray(soft).reshape(len(soft), -1)
         out = np.empty_like(columns)
         sharpened(columns, self.neighbours, excess, out)

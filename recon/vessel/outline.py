@@ -5,13 +5,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.vessel.centreline import Coordinates
 from recon.vessel.kernels import outline_radius, outline_spread
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Reals
+
 
 Floats = NDArray[np.float64]
 
@@ -48,7 +52,7 @@ class OutlineAt:
         outline_radius(*parts, np.ascontiguousarray(shape), *found)
         return found[0], found[1], found[2]
 
-    def spread(self, slope: Floats, out: Any) -> None:
+    def spread(self, slope: Floats, out: Reals) -> None:
         """Add slope · dr/d(coefficients) to ``out`` ``(n, splines · (2·orders + 1))``, of any
         float type."""
         outline_spread(slope, self.first, self.spline, self.wave, out)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -19,6 +19,10 @@ from recon.data_term import Quadratic
 from recon.vessel.data import least_squares, pilot
 from recon.vessel.data import scores as scores_in
 from recon.vessel.model import FAT, FIBROUS, Fit, VesselModel
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Reals
+
 
 Floats = NDArray[np.float64]
 
@@ -258,7 +262,7 @@ def texture(vessel: VesselModel, fit: Fit, rng: np.random.Generator) -> Residual
     )
 
 
-def _correlating(vessel: VesselModel, length_mm: float) -> Callable[[NDArray[Any]], NDArray[Any]]:
+def _correlating(vessel: VesselModel, length_mm: float) -> Callable[[Reals], Floats]:
     """A symmetric function that makes of white noise one of unit variance with the correlation
     exp(−r² / 2ℓ²).
 
@@ -277,7 +281,7 @@ def _correlating(vessel: VesselModel, length_mm: float) -> Callable[[NDArray[Any
     low, high = vessel.index.min(0), vessel.index.max(0) + 1
     box, place = tuple(high - low), tuple((vessel.index - low).T)
 
-    def smooth(v: NDArray[Any]) -> NDArray[Any]:
+    def smooth(v: Reals) -> Floats:
         out: Floats = np.empty(v.shape)
         for k in range(v.shape[1]):
             volume = np.zeros(box)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,10 @@ from recon.vessel.quality import STRIKING, Leftover, beside, leftover, misfit, t
 from recon.vessel.start import find_vessel
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import checked, number, numbers, whole
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 
 __all__ = ["PlaqueReading", "read_plaque"]
 
@@ -61,6 +65,16 @@ _FEW = 8
 """So many such voxels are enough."""
 _LESS_PURE = 0.8
 """The fraction where there are fewer."""
+
+
+class OtherCore(TypedDict):
+    """A core beside the first: how probable it is, where, and what it is like."""
+
+    probability: float
+    at_mm: list[float]
+    contrast_hu: float
+    contrast_sd_hu: float
+    volume_mm3: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +127,7 @@ class PlaqueReading:
     texture_high_hu: float
     info: Mapping[str, Any] = field(default_factory=dict)
     taken_off_hu: float = 0.0
-    third_core: Mapping[str, Any] | None = None
+    third_core: OtherCore | None = None
 
     @property
     def explained(self) -> bool:
@@ -166,7 +180,7 @@ class PlaqueReading:
             )
         return found
 
-    def read(self, volume: Any) -> dict[str, float]:
+    def read(self, volume: object) -> dict[str, float]:
         """Mean HU of another volume on the same grid in each region, and the contrast fibrous −
         core.
 
@@ -180,7 +194,7 @@ class PlaqueReading:
 
 
 @checked
-def core_regions(regions: Mapping[str, Any]) -> dict[str, NDArray[np.bool_]]:
+def core_regions(regions: Mapping[str, object]) -> dict[str, NDArray[np.bool_]]:
     """Voxels wholly inside of each region, from the shares of its voxels; regions without such
     voxels are left out."""
     found = {}
@@ -194,7 +208,7 @@ def core_regions(regions: Mapping[str, Any]) -> dict[str, NDArray[np.bool_]]:
 
 
 @checked
-def read_regions(regions: Mapping[str, Any], volume: Any) -> dict[str, float]:
+def read_regions(regions: Mapping[str, NDArray[np.float32]], volume: object) -> dict[str, float]:
     """See :meth:`PlaqueReading.read`.
 
     Args:
@@ -217,7 +231,7 @@ def read_regions(regions: Mapping[str, Any], volume: Any) -> dict[str, float]:
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def read_plaque(
     term: Quadratic,
-    point: Any = None,
+    point: ArrayLike | None = None,
     *,
     point_sd: float = 0.4,
     particles: int = 300,
@@ -358,7 +372,7 @@ def _read(
     prior: float,
     rng: np.random.Generator,
     seed: int,
-    other_core: Mapping[str, Any] | None = None,
+    other_core: OtherCore | None = None,
 ) -> PlaqueReading:
     others = len(fit.bodies)
     # the other core is the last of the fit's bodies
@@ -522,9 +536,7 @@ def _one_more(
     return probability, (more, cloud, float(more.evidence(more.shares(cloud.points)).mean.mean()))
 
 
-def _core_told(
-    space: CoreSpace, cloud: Cloud, contrast: float, probability: float
-) -> dict[str, Any]:
+def _core_told(space: CoreSpace, cloud: Cloud, contrast: float, probability: float) -> OtherCore:
     """Place, size and value of a core beside the first."""
     seen = space.evidence(space.shares(cloud.points))
     return {

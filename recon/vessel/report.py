@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,6 +15,11 @@ from recon.vessel.reading import CERTAIN, PlaqueReading
 from torchpcct.files import atomic_write
 from torchpcct.viz import Panel, panels
 from torchpcct.volume import Volume
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike
+
 
 _COLOURS = {
     "lumen": "tab:red",
@@ -32,7 +37,7 @@ Deviations = Mapping[str, Mapping[str, float]]
 
 def table(
     reading: PlaqueReading,
-    others: Mapping[str, Any] | None = None,
+    others: Mapping[str, ArrayLike] | None = None,
     deviations: Deviations | None = None,
 ) -> str:
     """Markdown: every figure with its 95 % interval, and what other volumes read over the same
@@ -117,7 +122,7 @@ def _hidden(reading: PlaqueReading) -> set[str]:
     )
 
 
-def picture(reading: PlaqueReading, others: Mapping[str, Any] | None = None) -> Any:
+def picture(reading: PlaqueReading, others: Mapping[str, ArrayLike] | None = None) -> Figure:
     """Sections across and along z through the core's centre: other volumes with the outlines, and
     the fitted tissues.
 
@@ -151,7 +156,7 @@ def picture(reading: PlaqueReading, others: Mapping[str, Any] | None = None) -> 
 def save(
     reading: PlaqueReading,
     folder: Path,
-    others: Mapping[str, Any] | None = None,
+    others: Mapping[str, ArrayLike] | None = None,
     deviations: Deviations | None = None,
 ) -> list[Path]:
     """Write ``report.md``, ``report.json``, ``tissues.nii.gz`` (labels), ``image.nii.gz`` and

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,10 @@ from scipy import ndimage
 from recon.vessel.centreline import Centreline, follow, sections, smooth_line
 from recon.vessel.model import Start
 from torchpcct.geometry import VolumeGrid
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 
 Floats = NDArray[np.float64]
 
@@ -111,7 +115,7 @@ def find_vessel(pilot: Floats, grid: VolumeGrid, point: Floats | None) -> Start:
     return Start(lumen_line, outer_line, ends, ((s, radii), (s2, radii2)), (fat, blood))
 
 
-def require_within(point: Any, grid: VolumeGrid) -> None:
+def require_within(point: ArrayLike, grid: VolumeGrid) -> None:
     """Refuse (ValueError) a point ``(3,)`` z, y, x mm outside of a volume."""
     low = np.array([a[0] for a in grid.axes]) - 0.5 * np.array(grid.spacing)
     if np.any(np.asarray(point) < low) or np.any(np.asarray(point) > low + np.array(grid.extent)):

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -28,6 +28,10 @@ from torchpcct.scanner.scanner import Scanner
 from torchpcct.scene.scene import Scene
 from torchpcct.scene.voxels import VoxelScene
 from torchpcct.validate import checked, whole
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Floats
+
 
 __all__ = ["acquire", "acquire_voxels"]
 
@@ -172,7 +176,7 @@ def acquire(
     return scan if exposure_s is None else scan.with_noise(exposure_s, seed)
 
 
-def readings_key(scene: Scene, scanner: Scanner, **options: Any) -> str | None:
+def readings_key(scene: Scene, scanner: Scanner, **options: object) -> str | None:
     """Names the expected readings of :func:`acquire` with these arguments: seed and exposure do
     not belong to them, unless the scene moves and ``rotation_s`` is that of the exposure."""
     if scene.is_static:
@@ -188,11 +192,11 @@ def _readings(
     plan_: Plan,
     bodies: Bodies,
     scanner: Scanner,
-    energies: Any,
+    energies: Floats,
     beam: Beam,
     known: KnownReadings,
-    progress: Any,
-    keep: Any,
+    progress: Callable[[float], None] | None,
+    keep: Callable[[str, Callable[[], Tensor]], Tensor],
 ) -> Tensor:
     """Expected readings ``(bins, views, rows, columns)`` of the kept cells, float32; those of the
     varying bodies join what is ``known``."""
@@ -303,10 +307,10 @@ def _voxel_readings(lines: Tensor, spectrum: Tensor, weight: Tensor) -> Tensor:
 def detected(
     scanner: Scanner,
     counts: Tensor,
-    air: Any,
-    energies: Any,
-    info: dict[str, Any],
-    surround: Any = None,
+    air: Floats,
+    energies: Floats,
+    info: dict[str, object],
+    surround: Floats | None = None,
     window: DetectorWindow | None = None,
 ) -> Scan:
     """The noise-free scan of expected readings, with what the detector makes of them.

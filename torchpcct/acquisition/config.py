@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -20,6 +20,12 @@ from torchpcct.scene.scene import Body, Scene
 from torchpcct.scene.voxels import DENSE, VoxelScene
 from torchpcct.validate import choice, number
 from torchpcct.volume import Volume
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+
+    from torchpcct.scene.bodies import Shape
+
 
 __all__ = ["SimulationConfig", "configured", "read_config"]
 
@@ -63,8 +69,8 @@ region: null                # grid to keep, such as
 tolerance_hu: 0.5           # effects below it are left out
 """
 
-_SHAPES: dict[str, Any] = {"cylinder": EllipticCylinder, "ellipsoid": Ellipsoid, "box": Box}
-_PRESETS: dict[str, Any] = {"pcct": presets.pcct, "eid": presets.eid}
+_SHAPES: dict[str, type[Shape]] = {"cylinder": EllipticCylinder, "ellipsoid": Ellipsoid, "box": Box}
+_PRESETS: dict[str, Callable[..., Scanner]] = {"pcct": presets.pcct, "eid": presets.eid}
 _GRID = ("shape", "spacing", "center")
 _KEYS = ("scene", "scanner", "exposure_s", "seed", "region", "tolerance_hu")
 
@@ -87,10 +93,10 @@ class SimulationConfig:
     exposure_s: float | None
     seed: int
     tolerance_hu: float
-    values: dict[str, Any]
+    values: dict[str, object]
 
 
-def read_config(path: Path, **changes: Any) -> SimulationConfig:
+def read_config(path: Path, **changes: object) -> SimulationConfig:
     """The configuration in a YAML file; ``changes`` replace its top-level values where they are not
     None.
 
@@ -104,7 +110,7 @@ def read_config(path: Path, **changes: Any) -> SimulationConfig:
     )
 
 
-def configured(values: Mapping[str, Any], folder: Path) -> SimulationConfig:
+def configured(values: Mapping[str, object], folder: Path) -> SimulationConfig:
     """The configuration of a mapping as in YAML; ``folder`` is where the files that it names lie.
 
     Raises:
@@ -128,13 +134,13 @@ def configured(values: Mapping[str, Any], folder: Path) -> SimulationConfig:
     return SimulationConfig(scene, scanner, grid, exposure, seed, tolerance, resolved)
 
 
-def grid_of(name: str, value: Any) -> VolumeGrid:
+def grid_of(name: str, value: object) -> VolumeGrid:
     """A grid of ``shape``, ``spacing`` and ``center``, numbers by axis or ``[z, y, x]``."""
     made: VolumeGrid = _build(name, VolumeGrid, _mapping(name, value, _GRID), order="zyx")
     return made
 
 
-def _mapping(name: str, value: Any, keys: Any) -> dict[str, Any]:
+def _mapping(name: str, value: object, keys: Collection[str]) -> dict[str, Any]:
     if not isinstance(value, Mapping):
         raise TypeError(
             f"{name} must be a mapping with {', '.join(keys)}, got {value!r:.200}; see torchpcct "
@@ -146,7 +152,7 @@ def _mapping(name: str, value: Any, keys: Any) -> dict[str, Any]:
     return dict(value)
 
 
-def _parameters(function: Any) -> dict[str, Any]:
+def _parameters(function: Callable[..., object]) -> dict[str, inspect.Parameter]:
     """Parameters of a function or class with their defaults (none: empty)."""
     return {
         n: p.default
@@ -155,7 +161,7 @@ def _parameters(function: Any) -> dict[str, Any]:
     }
 
 
-def _in_order(name: str, value: Any, order: str) -> Any:
+def _in_order(name: str, value: object, order: str) -> object:
     """Numbers by the names of their axes as a list in the ``order`` that a function takes; anything
     else as it is.
 
@@ -172,7 +178,12 @@ def _in_order(name: str, value: Any, order: str) -> Any:
     return [value[a] for a in order if a in value]
 
 
-def _build(name: str, function: Any, given: Mapping[str, Any], order: str = "xyz") -> Any:
+T = TypeVar("T")
+
+
+def _build(
+    name: str, function: Callable[..., T], given: Mapping[str, object], order: str = "xyz"
+) -> T:
     """What a function or class makes of the ``given`` parameters; those given by axis come in
     ``order``.
 
@@ -190,7 +201,7 @@ def _build(name: str, function: Any, given: Mapping[str, Any], order: str = "xyz
     return function(**given)
 
 
-def _scanner(value: Any, folder: Path) -> tuple[Scanner, dict[str, Any]]:
+def _scanner(value: object, folder: Path) -> tuple[Scanner, dict[str, object]]:
     given = dict(value) if isinstance(value, Mapping) else {}
     if "geometry" in given:
         return scanner_of(given, folder), given
@@ -202,7 +213,7 @@ def _scanner(value: Any, folder: Path) -> tuple[Scanner, dict[str, Any]]:
     return _PRESETS[preset](**resolved), {"preset": preset, **resolved}
 
 
-def _scene(value: Any, folder: Path) -> tuple[Scene | VoxelScene, dict[str, Any]]:
+def _scene(value: object, folder: Path) -> tuple[Scene | VoxelScene, dict[str, object]]:
     if not isinstance(value, Mapping):
         raise TypeError(
             f"scene must be a mapping with kind, got {value!r}; see torchpcct show-config"
@@ -236,7 +247,7 @@ def _scene(value: Any, folder: Path) -> tuple[Scene | VoxelScene, dict[str, Any]
     return (made.add(*more) if more else made), {"kind": kind, **given}
 
 
-def _body(k: int, value: Any) -> Body:
+def _body(k: int, value: object) -> Body:
     name = f"scene.bodies[{k}]"
     given = dict(value) if isinstance(value, Mapping) else {}
     shape = _SHAPES[choice(f"{name}.shape", given.pop("shape", None), tuple(_SHAPES))]
@@ -248,7 +259,7 @@ def _body(k: int, value: Any) -> Body:
     return Body(common["name"], solid, common["material"], common.get("parent"))
 
 
-def _voxels(given: dict[str, Any], folder: Path) -> tuple[VoxelScene, dict[str, Any]]:
+def _voxels(given: dict[str, Any], folder: Path) -> tuple[VoxelScene, dict[str, object]]:
     if "file" not in given:
         raise ValueError("a scene of kind volume needs file, a CT volume in HU")
     energy = given.get("energy_kev")

@@ -17,13 +17,18 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchpcct.cache_folder import private_folder
+
+if TYPE_CHECKING:
+    from torchpcct.acquisition.plan import Plan
+    from torchpcct.typing import Floats
+
 
 __all__ = ["forget_readings"]
 
@@ -42,8 +47,8 @@ class KnownReadings(NamedTuple):
         blocks: readings of the varying bodies by the name of the block of views.
     """
 
-    plan: Any
-    surround: Any
+    plan: Plan
+    surround: Floats
     blocks: dict[str, Tensor]
 
     @property
@@ -56,7 +61,7 @@ _held: OrderedDict[str, KnownReadings] = OrderedDict()
 _lock = threading.Lock()
 
 
-def fingerprint(*arguments: Any) -> str | None:
+def fingerprint(*arguments: object) -> str | None:
     """Names what readings are computed from, and the code that computes them; None where that
     cannot be told (a shape or material of the user's own that cannot be pickled)."""
     try:

@@ -9,7 +9,7 @@ that the limit of :mod:`torchpcct.metrics.cramer_rao` rests on.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -22,6 +22,10 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam
 from torchpcct.scene.chords import pack
 from torchpcct.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Floats
+
 
 _MU = 1e-4
 """mm⁻¹ of the medium whose readings tell its path: so thin that they are computed to second
@@ -92,7 +96,7 @@ def tissue_path_lengths(
     return out
 
 
-def _mixing(scene: Scene, names: Sequence[str | Sequence[str]]) -> tuple[list[int], Any]:
+def _mixing(scene: Scene, names: Sequence[str | Sequence[str]]) -> tuple[list[int], Floats]:
     """The bodies whose chords are needed, and the ``(tissues, bodies)`` signs that turn chords
     into path lengths."""
     if isinstance(names, str) or not len(names):

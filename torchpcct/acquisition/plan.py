@@ -13,7 +13,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +24,10 @@ from torchpcct.detector_window import NOISE_MARGIN_COLUMNS, DetectorWindow, foot
 from torchpcct.geometry import ConeBeam, VolumeGrid
 from torchpcct.scanner.scanner import Scanner
 from torchpcct.validate import number
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Floats
+
 
 __all__ = ["Plan", "make_plan"]
 
@@ -83,7 +87,7 @@ class Plan:
 
     effects: tuple[Effect, ...]
     nodes: Nodes
-    points: Any
+    points: Floats
     active: DetectorWindow | None
     kept: DetectorWindow | None
     sampling_error: float
@@ -110,7 +114,7 @@ class Plan:
         )
         return "\n".join(lines)
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """JSON values of the plan."""
         return {
             "tolerance_hu": self.tolerance_hu,
@@ -178,7 +182,7 @@ class _Probe:
         mono: bool = False,
         still: bool = False,
         nodes: Nodes | None = None,
-    ) -> Any:
+    ) -> Floats:
         """Line integrals of the probe, ``(views, rows, columns)``.
 
         Args:
@@ -274,7 +278,7 @@ def make_plan(
     # inset.
     chord = max(float(np.linalg.norm((bodies.high - bodies.low)[:2])) / 2, 1.0)
 
-    def cost(difference: Any) -> float:
+    def cost(difference: Floats) -> float:
         """Error of the line integrals as a CT number: rms over the footprint, spread over the
         bodies' chord."""
         if not mask.any():

@@ -44,7 +44,7 @@ _DETECTORS = {"silicon": SiliconDetector, "scintillator": Scintillator}
 _BOWTIE = ("material", "fan_angles_deg", "thickness_mm")
 
 
-def scanner_of(values: Any, folder: Path = Path()) -> Scanner:
+def scanner_of(values: object, folder: Path = Path()) -> Scanner:
     """The scanner that a mapping describes; see the module's text.
 
     Args:
@@ -76,7 +76,7 @@ def scanner_of(values: Any, folder: Path = Path()) -> Scanner:
     )
 
 
-def _mapping(name: str, value: Any, keys: tuple[str, ...]) -> dict[str, Any]:
+def _mapping(name: str, value: object, keys: tuple[str, ...]) -> dict[str, Any]:
     if not isinstance(value, Mapping):
         raise TypeError(f"{name} must be a mapping of {', '.join(keys)}, got {value!r:.200}")
     unknown = sorted(str(key) for key in value if key not in keys)
@@ -85,7 +85,7 @@ def _mapping(name: str, value: Any, keys: tuple[str, ...]) -> dict[str, Any]:
     return dict(value)
 
 
-def _slabs(name: str, value: Any) -> Slabs:
+def _slabs(name: str, value: object) -> Slabs:
     """Material and thickness in mm of each slab."""
     if not isinstance(value, Mapping):
         raise TypeError(f"{name} must be a mapping such as {{aluminium: 2.5}} (mm), got {value!r}")
@@ -95,7 +95,7 @@ def _slabs(name: str, value: Any) -> Slabs:
     )
 
 
-def _source(value: Any, folder: Path) -> Source:
+def _source(value: object, folder: Path) -> Source:
     known = tuple(f.name for f in fields(Source) if f.name != "table")
     given = _mapping("scanner.source", value, (*known, "spectrum"))
     if "filtration" in given:
@@ -112,7 +112,7 @@ def _source(value: Any, folder: Path) -> Source:
     return Source.tabulated(*np.asarray(numbers).T, **given)
 
 
-def _detector(value: Any) -> SiliconDetector | Scintillator:
+def _detector(value: object) -> SiliconDetector | Scintillator:
     given = dict(value) if isinstance(value, Mapping) else {}
     kind = choice("scanner.detector.kind", given.pop("kind", None), tuple(_DETECTORS))
     made: Any = _DETECTORS[kind]
@@ -126,7 +126,7 @@ def _detector(value: Any) -> SiliconDetector | Scintillator:
     return detector
 
 
-def _bowties(value: Any) -> tuple[Bowtie, ...]:
+def _bowties(value: object) -> tuple[Bowtie, ...]:
     if value in (None, "none"):
         return ()
     if value == "large":

@@ -10,7 +10,7 @@ A631), as many as keep the error of every reading below a bound that is tried ou
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +51,7 @@ class Nodes(NamedTuple):
         return cls(np.arange(spectra.shape[-1]), spectra, 0.0)
 
 
-def signal_spectra(scanner: Scanner) -> tuple[Any, Any, Any]:
+def signal_spectra(scanner: Scanner) -> tuple[Floats, Floats, Floats]:
     """Energies, ``(bins, columns, energies)`` signal per energy in air, and the air readings
     ``(bins, rows, columns)``.
 

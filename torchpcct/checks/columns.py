@@ -69,7 +69,7 @@ def column_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     Raises:
         ValueError: a wrong shape, NaN or Inf.
     """
-    g: Any = geometry
+    g: Geometry = geometry
     check_lines(lines, g.shape)
     if g.columns < _FEWEST_COLUMNS or g.views < _FEWEST_VIEWS:
         return UNKNOWN
@@ -159,7 +159,13 @@ def _gain(blocks: Floats, g: Any) -> tuple[float, str]:
 
 
 def _gain_text(
-    wrong: NDArray[np.bool_], row: int, column: int, width: int, size: float, error: float, g: Any
+    wrong: NDArray[np.bool_],
+    row: int,
+    column: int,
+    width: int,
+    size: float,
+    error: float,
+    g: Geometry,
 ) -> str:
     many = int(wrong.sum()) - 1
     what = f"column {column}" if width == 1 else f"columns {column} … {column + width - 1}"
@@ -174,7 +180,7 @@ def _gain_text(
     )
 
 
-def _place(lines: Tensor, g: Any) -> tuple[float, float]:
+def _place(lines: Tensor, g: Geometry) -> tuple[float, float]:
     """Shift of the columns that alternates, in columns, and its error from the scatter of blocks
     of views."""
     rows = lines.detach().reshape(g.views, -1, g.columns)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,6 +23,10 @@ from torchpcct.readings import MEDIAN_TO_SD, MOST_DEAD, dispersion, interpolate_
 from torchpcct.scan import Scan
 from torchpcct.threads import run
 from torchpcct.validate import shaped
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Floats, Ints
+
 
 __all__ = ["Defects", "dead_readings", "find_defects", "repair_defects"]
 
@@ -98,7 +102,7 @@ class Defects:
 def find_defects(
     counts: Tensor,
     air: Tensor,
-    first_column: Any = None,
+    first_column: object = None,
     *,
     known: Tensor | None = None,
     photon: float = 1.0,
@@ -139,7 +143,7 @@ def find_defects(
         )
     n = counts.detach().cpu().numpy()
     views, _, columns = n.shape
-    first: Any = (
+    first: Ints = (
         np.zeros(views, np.int64) if first_column is None else np.asarray(first_column, np.int64)
     )
     if first.shape != (views,) or first.min() < 0 or first.max() + columns > air.shape[1]:
@@ -200,7 +204,7 @@ def dark_views(share: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def cell_sums(
-    n: Any, air: Tensor, first: Any, lost: NDArray[np.bool_], light: float
+    n: NDArray[np.float32], air: Tensor, first: Ints, lost: NDArray[np.bool_], light: float
 ) -> NDArray[np.float64]:
     """What the readings of every cell add up to over the views that have a signal, row by row for
     itself.
@@ -382,7 +386,11 @@ def _dimmed(level: NDArray[np.float64], dead: NDArray[np.bool_]) -> NDArray[np.f
 
 
 def _isolated(
-    n: NDArray[Any], at: NDArray[np.int64], first: NDArray[np.int64], light: float, reach: int = 1
+    n: NDArray[np.float32],
+    at: NDArray[np.int64],
+    first: NDArray[np.int64],
+    light: float,
+    reach: int = 1,
 ) -> NDArray[np.int64]:
     """Those of the zeros ``at`` ``(k, 3)`` whose non-zero neighbours in the row and the next rows
     are bright on both sides; and not both dim in the rows, or the views, beside: a detail as narrow
@@ -400,7 +408,7 @@ def _isolated(
     return at[good & ~_dim(np.stack(onward), light)]
 
 
-def _dim_rows(n: NDArray[Any], at: NDArray[np.int64], light: float) -> NDArray[np.bool_]:
+def _dim_rows(n: NDArray[np.float32], at: NDArray[np.int64], light: float) -> NDArray[np.bool_]:
     """Whether the zeros ``at`` have only dim neighbours in the rows beside, as an upright detail
     has."""
     if n.shape[1] == 1:
@@ -408,12 +416,14 @@ def _dim_rows(n: NDArray[Any], at: NDArray[np.int64], light: float) -> NDArray[n
     return _dim(_around(n, at, 0)[[0, 2]], light)
 
 
-def _dim(pair: NDArray[Any], light: float) -> NDArray[np.bool_]:
+def _dim(pair: NDArray[np.float32], light: float) -> NDArray[np.bool_]:
     """Whether there is a reading in ``(2, k)`` pairs, and none that is bright."""
     return np.asarray((pair > 0).any(0) & ~(pair > light).any(0))
 
 
-def _around(n: NDArray[Any], at: NDArray[np.int64], column: Any, view: Any = 0) -> NDArray[Any]:
+def _around(
+    n: NDArray[np.float32], at: NDArray[np.int64], column: int | Ints, view: int | Ints = 0
+) -> NDArray[np.float32]:
     """The readings ``column`` columns (and ``view`` views) from ``at``, in the same row and the
     next ones: ``(1 | 3, k)``; 0 beyond the detector, NaN beyond the first and the last view."""
     limits = np.array(n.shape) - 1
@@ -428,8 +438,8 @@ def _around(n: NDArray[Any], at: NDArray[np.int64], column: Any, view: Any = 0) 
 
 
 def _company(
-    n: NDArray[Any], at: NDArray[np.int64], first: NDArray[np.int64], step: int, apart: int
-) -> NDArray[Any]:
+    n: NDArray[np.float32], at: NDArray[np.int64], first: NDArray[np.int64], step: int, apart: int
+) -> NDArray[np.bool_]:
     """Whether the view ``step`` from the zeros ``at`` has one within ``apart`` columns, too;
     True beyond the scan."""
     there = np.clip(at[:, 0] + step, 0, len(n) - 1)
@@ -443,7 +453,11 @@ def _company(
 
 
 def _unshadowed(
-    n: NDArray[Any], at: NDArray[np.int64], first: NDArray[np.int64], columns: int, light: float
+    n: NDArray[np.float32],
+    at: NDArray[np.int64],
+    first: NDArray[np.int64],
+    columns: int,
+    light: float,
 ) -> tuple[NDArray[np.int64], int, int]:
     """Those of the zeros ``at`` ``(k, 3)`` that are no footprint; how many of them are of cells
     that were dead for a while, and how many cells those are.
@@ -486,7 +500,7 @@ def _unshadowed(
         axis=0,
     )
 
-    def share(values: NDArray[Any]) -> NDArray[Any]:
+    def share(values: NDArray[np.generic]) -> Floats:
         return np.add.reduceat(values.astype(np.float64), starts) / lengths
 
     middle = starts + lengths // 2
@@ -517,7 +531,7 @@ def _unshadowed(
     return at[good[which]], int(lengths[lasting].sum()), len(cells)
 
 
-def _middle(values: NDArray[Any]) -> NDArray[Any]:
+def _middle(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Median of the bright ones of ``(k, places)`` at each place, 0 where there is none; NaN
     stays."""
     if len(values) == 1:
@@ -529,8 +543,8 @@ def _middle(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _flank(
-    n: NDArray[Any], at: NDArray[np.int64], side: int
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    n: NDArray[np.float32], at: NDArray[np.int64], side: int
+) -> tuple[Ints, Floats, NDArray[np.float32]]:
     """The first reading above 0 on one side of the zeros ``at``: how many columns away (0: none
     near), it, the next."""
     distance = np.zeros(len(at), np.int64)

@@ -244,7 +244,7 @@ def _beyond(theta: Floats, y: Floats, order: int) -> tuple[float, float]:
     """Root mean square of the slow changes of ``y`` beyond a constant and waves up to ``order``,
     and its error."""
     own = _waves(theta, tuple(range(1, order + 1)))
-    more: Any
+    more: NDArray[np.floating]
     if theta.size * view_step(theta) > 1.9 * math.pi:
         more = _waves(theta, tuple(range(order + 1, _SLOW + 1)))[:, 1:]
     else:

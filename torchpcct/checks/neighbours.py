@@ -32,7 +32,7 @@ from __future__ import annotations
 import hashlib
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -43,6 +43,10 @@ from torchpcct.checks.scan_test import UNKNOWN, ScanTest, check_lines
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
 from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.validate import checked
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
 
 __all__ = ["neighbour_test", "stuck_views"]
 
@@ -475,7 +479,7 @@ class _Views:
             return None
         values, slopes = self.means(width), self.means(width, slope=True)
         best: tuple[float, float, str] | None = None
-        patterns: list[tuple[str, Any]] = [("columns", slopes)]
+        patterns: list[tuple[str, Sequence[Floats]]] = [("columns", slopes)]
         if isinstance(self.g, ConeBeam) and values[0].shape[1] >= 3:
             patterns.append(("rows", [np.gradient(v, axis=1) for v in values]))
         bends = [v[1:-1] - (v[2:] + v[:-2]) / 2.0 for v in values]
@@ -506,7 +510,7 @@ class _Views:
         return best
 
     def _alternates(
-        self, bends: list[Floats], slope: Any, period: int
+        self, bends: list[Floats], slope: Sequence[Floats], period: int
     ) -> tuple[float, float] | None:
         """Peak-to-peak shift of views with this period, and its error from the scatter of blocks
         of views."""
@@ -612,7 +616,7 @@ def stuck_views(readings: Tensor, geometry: Geometry) -> list[str]:
     ]
 
 
-def _dark_columns(n: NDArray[Any], order: NDArray[np.int64]) -> list[str]:
+def _dark_columns(n: NDArray[np.float32], order: NDArray[np.int64]) -> list[str]:
     """Columns side by side that go dark at once, stay so, and are bright again at once: no shadow
     does that.
 
@@ -657,7 +661,7 @@ def _dark_columns(n: NDArray[Any], order: NDArray[np.int64]) -> list[str]:
     ]
 
 
-def _copies(n: NDArray[Any], told: NDArray[np.bool_], angles: Floats) -> list[int]:
+def _copies(n: NDArray[np.float32], told: NDArray[np.bool_], angles: Floats) -> list[int]:
     """Whole views that repeat another one at a different angle, most of whose readings say
     something."""
     first: dict[bytes, int] = {}
@@ -686,7 +690,7 @@ def _columns_text(edges: NDArray[np.int64], stuck: NDArray[np.bool_]) -> str:
     return f" in the columns {edges[at[0]]} … {edges[at[-1]] + _STUCK_COLUMNS - 1}"
 
 
-def _noisy(n: NDArray[Any], edges: NDArray[np.int64], stuck: NDArray[np.bool_]) -> bool:
+def _noisy(n: NDArray[np.float32], edges: NDArray[np.int64], stuck: NDArray[np.bool_]) -> bool:
     """Whether what changes from view to view in the columns that were stuck differs from column
     to column."""
     products, squares = 0.0, 0.0

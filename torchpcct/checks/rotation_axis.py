@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -88,13 +88,16 @@ class RotationAxis:
         return f"axis at column {self.column:.{digits}f} ± {up:.{digits}f}"
 
 
-def axis_column(geometry: Any) -> float:
+G = TypeVar("G", bound=Geometry)
+
+
+def axis_column(geometry: Geometry) -> float:
     """Column onto which the rotation axis projects, as the geometry describes it."""
     pitch, offset = geometry.column_pitch, geometry.column_offset
     return float((geometry.columns - 1) / 2 - offset / pitch)
 
 
-def at_axis(geometry: Any, column: float) -> Any:
+def at_axis(geometry: G, column: float) -> G:
     """The geometry whose axis projects onto ``column``."""
     return geometry.with_column_offset(
         ((geometry.columns - 1) / 2 - column) * geometry.column_pitch
@@ -112,7 +115,7 @@ def rotation_axis(lines: Tensor, geometry: Geometry) -> RotationAxis:
         ValueError: too few conjugate rays (less than half a turn of parallel rays, a fan or cone
             beam that meets hardly any line twice), or nothing to be seen.
     """
-    g: Any = geometry
+    g: Geometry = geometry
     shares = _shares(g.angles)
     shared = (
         0.0 if shares is None else torch.tensordot(torch.from_numpy(shares).to(lines), lines, 1)
@@ -184,7 +187,7 @@ def _turned(angles: Floats) -> Floats:
     return np.mod(turn - begin + 1e-9, 2 * math.pi) - 1e-9
 
 
-def _by_conjugates(lines: Tensor, geometry: Any) -> tuple[float, float] | None:
+def _by_conjugates(lines: Tensor, geometry: Geometry) -> tuple[float, float] | None:
     """Column and its standard error; None where hardly any ray has a conjugate, or they are
     alike by chance."""
     column = _coarse(lines, geometry)
@@ -204,7 +207,7 @@ def _by_conjugates(lines: Tensor, geometry: Any) -> tuple[float, float] | None:
     return (column, error) if alike else None
 
 
-def _likeness(lines: Tensor, geometry: Any) -> float:
+def _likeness(lines: Tensor, geometry: Geometry) -> float:
     """By how many standard deviations conjugate rays resemble each other more than noise does.
 
     Of noise alone the products of the two are as often below 0 as above: the sums over parts of the
@@ -226,7 +229,7 @@ def _likeness(lines: Tensor, geometry: Any) -> float:
     return float(parts.sum()) / spread if spread > 0 else 0.0
 
 
-def _coarse(lines: Tensor, geometry: Any) -> float | None:
+def _coarse(lines: Tensor, geometry: Geometry) -> float | None:
     """The column at which conjugate rays resemble each other most, to about one; of a cone beam
     in one row."""
     window = DetectorWindow.full(geometry)

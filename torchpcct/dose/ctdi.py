@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,10 @@ from torchpcct.scanner import Scanner
 from torchpcct.scene import Scene
 from torchpcct.scene.phantoms.quality import CTDI_HOLES, ctdi
 from torchpcct.validate import checked
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 
 __all__ = ["CtdiDose", "ctdi_dose"]
 
@@ -71,7 +75,7 @@ class CtdiDose:
         return math.hypot(self.central_error, 2.0 * self.peripheral_error) / 3.0
 
 
-def disc_samples(center: Any, radius: float, count: int = _SAMPLES) -> Floats:
+def disc_samples(center: ArrayLike, radius: float, count: int = _SAMPLES) -> Floats:
     """``count`` points that fill a disc evenly (sunflower seeds), ``(count, 2)`` of x, y in mm."""
     k = np.arange(count) + 0.5
     r, phi = radius * np.sqrt(k / count), k * (math.pi * (3.0 - math.sqrt(5.0)))

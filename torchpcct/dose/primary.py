@@ -12,7 +12,7 @@ focal spot to the point. Scattered photons are added by :mod:`torchpcct.dose.sca
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
@@ -36,6 +36,10 @@ from torchpcct.scene.materials import material
 from torchpcct.scene.scene import voxel_centres
 from torchpcct.threads import run
 from torchpcct.validate import checked, choice, number, whole
+
+if TYPE_CHECKING:
+    from torchpcct.scene.materials import Material
+
 
 __all__ = ["primary_dose"]
 
@@ -111,7 +115,7 @@ def _dose(
         out[i] = total / cos_b.size
 
 
-def slice_points(where: Any, z_mm: float) -> Floats:
+def slice_points(where: object, z_mm: float) -> Floats:
     """Points ``(..., 3)`` of a slice in mm: the voxel centres of a 2-D grid, or points ``(..., 2)``
     of x, y.
 
@@ -144,12 +148,12 @@ def check_static(scene: Scene) -> None:
 def primary_dose(
     scene: Scene,
     scanner: Scanner,
-    where: Any,
+    where: object,
     exposure_s: float,
     *,
     z_mm: float = 0.0,
     views: int = 360,
-    medium: Any = None,
+    medium: Material | str | None = None,
     quantity: str = "absorbed",
     axial: str = "plane",
     group_kev: float = _GROUP_KEV,

@@ -17,7 +17,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,10 @@ from torchpcct.scene import Scene
 from torchpcct.scene.materials import Material
 from torchpcct.threads import run
 from torchpcct.validate import checked, number, whole
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 
 __all__ = ["MonteCarloDose", "monte_carlo_dose"]
 
@@ -75,7 +79,7 @@ class MonteCarloDose:
     batches: Floats
     histories: int
 
-    def mean(self, mask: Any) -> tuple[float, float, float]:
+    def mean(self, mask: ArrayLike) -> tuple[float, float, float]:
         """Primary dose, scattered dose and the standard error of the latter, mean over the voxels
         of ``mask``.
 
@@ -111,7 +115,7 @@ def _form_factor(material: Material) -> tuple[Floats, Floats]:
     return x2, cumulative + 1e-12 * cumulative[-1] * np.arange(x.size)
 
 
-def _tables(materials: list[Material], highest_kev: float) -> tuple[Any, ...]:
+def _tables(materials: list[Material], highest_kev: float) -> tuple[Floats, ...]:
     count = max(math.ceil((highest_kev - _CUTOFF_KEV) / _TABLE_STEP_KEV) + 2, 3)
     energies = _CUTOFF_KEV + _TABLE_STEP_KEV * np.arange(count)
     kinds = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -13,6 +13,12 @@ from torchpcct.formats.damage import check_expansion, check_size, needed, readin
 from torchpcct.formats.file_names import matching
 from torchpcct.formats.hdf5 import inside
 from torchpcct.validate import choice
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from torchpcct.typing import Array
+
 
 _HDF5_AT = 512
 """Where the HDF5 of a MATLAB file of version 7.3 begins."""
@@ -31,7 +37,11 @@ _OF_NUMBERS = (
 """MATLAB's classes of numbers."""
 
 
-def read_array(name: str | Sequence[str], folder: Path = Path(), pick: Any = None) -> Any:
+Pick: TypeAlias = "Callable[[tuple[int, ...]], tuple[slice, ...]]"
+"""From an array's shape to the index of what is read, one slice an axis."""
+
+
+def read_array(name: str | Sequence[str], folder: Path = Path(), pick: Pick | None = None) -> Array:
     """Numbers of ``.npy``, Zarr, TIFF or MATLAB files: one file, or several that are stacked.
 
     Args:
@@ -58,7 +68,7 @@ def read_array(name: str | Sequence[str], folder: Path = Path(), pick: Any = Non
     return np.stack(arrays)
 
 
-def _read_file(path: Path, pick: Any = None) -> Any:
+def _read_file(path: Path, pick: Pick | None = None) -> Array:
     """The numbers of a file; with ``pick``, a function of the number of axes and the first length,
     no more of them than the index that it returns."""
     ending = path.suffix.lower()
@@ -84,7 +94,7 @@ def _read_file(path: Path, pick: Any = None) -> Any:
     raise ValueError(f"{path.name}: readings must be .npy, .zarr, .tif, .tiff or .mat")
 
 
-def _tiff(path: Path, pick: Any) -> Any:
+def _tiff(path: Path, pick: Pick | None) -> Array:
     tifffile = needed("tifffile")
     with reading(path, "a TIFF image"), tifffile.TiffFile(path) as file:
         # A page that is cut off reads as zeros in some readers: sizes are checked before.
@@ -113,13 +123,13 @@ def _tiff(path: Path, pick: Any) -> Any:
         return np.stack([file.pages[int(k)].asarray()[at[1:]] for k in np.arange(shape[0])[at[0]]])
 
 
-def given_array(given: Any) -> Any:
+def given_array(given: object) -> Any:
     """A number or an array as it is, or that of the file or pattern that is named
     (:func:`read_array`)."""
     return read_array(os.fspath(given)) if isinstance(given, str | os.PathLike) else given
 
 
-def read_mat(path: str | os.PathLike[str], variable: str | None = None) -> Any:
+def read_mat(path: str | os.PathLike[str], variable: str | None = None) -> Array:
     """An array of a MATLAB file, its axes in MATLAB's order.
 
     Args:
@@ -152,7 +162,7 @@ def _picked(found: dict[str, tuple[int, ...]], variable: str | None) -> str:
     return arrays[0]
 
 
-def _old(path: str | os.PathLike[str], variable: str | None) -> Any:
+def _old(path: str | os.PathLike[str], variable: str | None) -> Array:
     from scipy.io import loadmat, whosmat
 
     held = {name: shape for name, shape, kind in whosmat(path) if kind in _OF_NUMBERS}
@@ -161,7 +171,7 @@ def _old(path: str | os.PathLike[str], variable: str | None) -> Any:
     return loadmat(path, variable_names=[name])[name]
 
 
-def _new(path: str | os.PathLike[str], variable: str | None) -> Any:
+def _new(path: str | os.PathLike[str], variable: str | None) -> Array:
     import h5py
 
     with h5py.File(path, "r") as file:

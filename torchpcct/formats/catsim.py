@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from torchpcct.formats.damage import reading
 from torchpcct.geometry import Geometry
 from torchpcct.scan import Scan
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Reals
+
 
 __all__ = ["read_catsim"]
 
@@ -49,7 +53,7 @@ def read_catsim(results: str | os.PathLike[str], geometry: Geometry, **options: 
     )
 
 
-def _raw(path: Path, shape: tuple[int, ...]) -> Any:
+def _raw(path: Path, shape: tuple[int, ...]) -> Reals:
     with reading(path, "raw float32 readings"):
         expected = 4 * int(np.prod(shape))
         if path.stat().st_size != expected:

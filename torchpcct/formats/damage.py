@@ -11,18 +11,25 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from torchpcct.files import require_ordinary
 from torchpcct.memory import free_bytes
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from types import ModuleType
+
+    from torchpcct.typing import Array
+
+
 MOST_READINGS = 2**36
 """Headers that promise more numbers than this are damaged; nothing is allocated for them."""
 
 
-def needed(package: str) -> Any:
+def needed(package: str) -> ModuleType:
     """An optional package; ``ImportError`` that says how to install it."""
     try:
         return importlib.import_module(package)
@@ -78,7 +85,7 @@ def reading(path: str | os.PathLike[str], what: str) -> Iterator[None]:
         ) from error
 
 
-def read_yaml(path: str | os.PathLike[str], what: str) -> Any:
+def read_yaml(path: str | os.PathLike[str], what: str) -> object:
     """Values of a YAML file of a user, read as ``what`` with :func:`yaml_values`.
 
     Raises:
@@ -118,7 +125,7 @@ def _text(path: str | os.PathLike[str]) -> str:
     return _decoded(content)
 
 
-def read_numbers(path: str | os.PathLike[str], what: str) -> Any:
+def read_numbers(path: str | os.PathLike[str], what: str) -> Array:
     """Numbers of a ``.npy`` or text file, in columns as they stand there.
 
     Raises:
@@ -131,7 +138,7 @@ def read_numbers(path: str | os.PathLike[str], what: str) -> Any:
         return np.loadtxt(io.StringIO(_text(path)), dtype=np.float64)
 
 
-def yaml_values(text: str) -> Any:
+def yaml_values(text: str) -> object:
     """Values of a YAML text, bounded: a few hundred bytes of aliases to aliases can stand for any
     number of values.
 
@@ -143,7 +150,7 @@ def yaml_values(text: str) -> Any:
 
     if len(text) > _MOST_TEXT:
         raise ValueError(f"it has more than {_MOST_TEXT} characters: put arrays into .npy files")
-    loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    loader: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
         _check_yaml(yaml.parse(text, Loader=loader))
         return yaml.load(text, Loader=loader)
@@ -155,12 +162,12 @@ def yaml_values(text: str) -> Any:
         ) from error
 
 
-def _check_yaml(events: Any) -> None:
+def _check_yaml(events: Iterable[object]) -> None:
     """Count what a text stands for as it is parsed, before anything is built."""
     import yaml
 
     counts, names = [0], [None]  # of the open collections, and their anchors
-    anchored: dict[Any, int] = {}
+    anchored: dict[object, int] = {}
     for event in events:
         if isinstance(event, yaml.CollectionStartEvent):
             if len(counts) > _DEEPEST_YAML:
@@ -192,7 +199,7 @@ def _check_yaml(events: Any) -> None:
             )
 
 
-def check_size(shape: Any, what: str) -> None:
+def check_size(shape: Sequence[int], what: str) -> None:
     """Refuse a shape that a damaged header may promise (ValueError)."""
     total = 1
     for n in shape:
@@ -203,7 +210,9 @@ def check_size(shape: Any, what: str) -> None:
         raise ValueError(f"{what} has the shape {tuple(shape)}: too large to be true")
 
 
-def check_expansion(shape: Any, what: str, packed: int | Callable[[], int], each: int = 4) -> None:
+def check_expansion(
+    shape: Sequence[int], what: str, packed: int | Callable[[], int], each: int = 4
+) -> None:
     """Refuse numbers that are to be read into memory if they do not fit, or if no file so small can
     hold them.
 

@@ -11,7 +11,7 @@ import math
 import os
 import warnings
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Unpack
 
 import numpy as np
 
@@ -25,6 +25,13 @@ from torchpcct.geometry import ParallelBeam
 from torchpcct.readings import TRANSFER_FRAMES
 from torchpcct.scan import Scan
 from torchpcct.validate import number
+
+if TYPE_CHECKING:
+    import h5py
+    from numpy.typing import ArrayLike
+
+    from torchpcct.typing import Array, Bools, CountsOptions, Floats
+
 
 __all__ = ["read_data_exchange"]
 
@@ -57,15 +64,15 @@ class Frames(NamedTuple):
 
     path: str
     format: str
-    data: Any
-    white: Any
-    dark: Any
-    angles: Any
+    data: Array
+    white: ArrayLike
+    dark: ArrayLike
+    angles: Floats
     pitch: float | None
     pixel_size: str
     rows: list[int] | None
 
-    def scan(self, mu_water: float | None = None, **options: Any) -> Scan:
+    def scan(self, mu_water: float | None = None, **options: Unpack[CountsOptions]) -> Scan:
         """The scan, its rotation axis in the detector's middle.
 
         Args:
@@ -86,7 +93,7 @@ class Frames(NamedTuple):
             raise ValueError(
                 f"slices= must lie within the {self.rows[2] if self.rows else 0} rows of the file"
             )
-        info: dict[str, Any] = {
+        info: dict[str, object] = {
             "file": self.path,
             "format": self.format,
             "pixel_size": self.pixel_size,
@@ -115,11 +122,11 @@ def read_data_exchange(
     *,
     pitch: float | None = None,
     slices: slice | None = None,
-    angles_deg: Any = None,
-    air: Any = None,
-    dark: Any = None,
+    angles_deg: object = None,
+    air: ArrayLike | str | os.PathLike[str] | None = None,
+    dark: ArrayLike | str | os.PathLike[str] | None = None,
     mu_water: float | None = None,
-    **options: Any,
+    **options: Unpack[CountsOptions],
 ) -> Scan:
     """A parallel-beam scan: ``/exchange/data`` (views, rows, columns) with white and dark frames
     and ``theta``.
@@ -196,14 +203,14 @@ def read_data_exchange(
         ).scan(mu_water, **options)
 
 
-def _rows(data: Any, rows: slice) -> Any:
+def _rows(data: h5py.Dataset, rows: slice) -> Array:
     """Some rows of a data set ``(frames, rows, columns)``."""
     size = (data.shape[0], max(1, len(range(*rows.indices(data.shape[1])))), data.shape[2])
     check_expansion(size, data.name, data.id.get_storage_size, data.dtype.itemsize)
     return data[:, rows]
 
 
-def _frames(data: Any, shape: tuple[int, ...], rows: slice) -> Any:
+def _frames(data: h5py.Dataset | None, shape: tuple[int, ...], rows: slice) -> ArrayLike | None:
     """Frames without the object or without beam: several, one, or one number for all cells;
     None: there are none."""
     if data is None:
@@ -214,7 +221,7 @@ def _frames(data: Any, shape: tuple[int, ...], rows: slice) -> Any:
     return given_frames(np.asarray(data[()]), shape, rows)
 
 
-def given_frames(given: Any, shape: tuple[int, ...], rows: slice) -> Any:
+def given_frames(given: object, shape: tuple[int, ...], rows: slice) -> Any:
     """Frames that a caller gives: a number, frames of the whole detector or of the rows, or the
     name of their file."""
     values = np.asarray(given_array(given))
@@ -223,7 +230,7 @@ def given_frames(given: Any, shape: tuple[int, ...], rows: slice) -> Any:
     return values[..., rows, :] if values.ndim > 1 and values.shape[-2] == shape[1] else values
 
 
-def angles_in(data: Any, views: int, what: str, of: Any = slice(None)) -> Any:
+def angles_in(data: h5py.Dataset, views: int, what: str, of: slice | Bools = slice(None)) -> Floats:
     """Angles ``(views,)`` in rad of a data set with or without a unit.
 
     Args:
@@ -268,7 +275,7 @@ def angles_in(data: Any, views: int, what: str, of: Any = slice(None)) -> Any:
     return np.deg2rad(angles)
 
 
-def length_in(data: Any) -> tuple[float | None, str]:
+def length_in(data: h5py.Dataset) -> tuple[float | None, str]:
     """A length in mm of a data set of one number, None if it has no known unit or is none; and
     what it says."""
     unit = unit_text(data.attrs.get("units", "m"))
@@ -277,7 +284,7 @@ def length_in(data: Any) -> tuple[float | None, str]:
     return value * MM[unit] if known else None, f"the file's pixel size is {value:g} {unit}"
 
 
-def _pixel_size(file: Any) -> tuple[float | None, str]:
+def _pixel_size(file: h5py.File) -> tuple[float | None, str]:
     """The pixel size in mm, None if the file does not know it, and what it says of it."""
     for name in _PIXEL:
         data = inside(file, name)

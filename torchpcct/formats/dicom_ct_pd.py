@@ -13,7 +13,7 @@ import math
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -25,6 +25,13 @@ from torchpcct.formats.dicom_series import dicom_files, open_dicom
 from torchpcct.geometry import ConeBeam
 from torchpcct.scan import Scan
 from torchpcct.validate import whole
+
+if TYPE_CHECKING:
+    import pydicom
+    from numpy.typing import ArrayLike
+
+    from torchpcct.typing import Floats32, Ints
+
 
 __all__ = ["read_dicom_ct_pd"]
 
@@ -71,7 +78,7 @@ class ClinicalProjections(NamedTuple):
     motion: NDArray[np.float64] | None
     mu_water: float | None
     photons: NDArray[np.float64] | None
-    info: dict[str, Any]
+    info: dict[str, object]
 
     def scan(self) -> Scan:
         """The scan of a table at rest.
@@ -90,7 +97,7 @@ class ClinicalProjections(NamedTuple):
         )
 
 
-def _value(file: Any, name: str, default: Any = None) -> Any:
+def _value(file: pydicom.Dataset, name: str, default: ArrayLike | None = None) -> Any:
     """Numbers of a private tag, whether or not the reader knows its type: float32 if it comes as
     bytes."""
     tag = _TAGS[name]
@@ -201,7 +208,7 @@ def read_dicom_ct_pd(
         motion = np.zeros((len(views), 3))
         motion[:, 0] = heights[0] - heights
     water = float(g["water"]) if g["water"] else None
-    info: dict[str, Any] = {
+    info: dict[str, object] = {
         "file": str(folder),
         "format": "DICOM-CT-PD",
         "flying_focal_spot": g["spot"],
@@ -226,10 +233,10 @@ class _View(NamedTuple):
     height: float
     radius: float
     shift: tuple[float, ...]
-    lines: Any
+    lines: Floats32
 
 
-def _check_complete(folder: Any, numbers: Any) -> None:
+def _check_complete(folder: str | os.PathLike[str], numbers: Ints) -> None:
     """Raise ``ValueError`` unless instance numbers count up in equal steps: every view, or every
     second one, …"""
     steps = np.diff(numbers)
@@ -242,7 +249,7 @@ def _check_complete(folder: Any, numbers: Any) -> None:
 
 
 def _from_one_spot(
-    folder: Any, views: list[_View], kind: str, ignore: bool, spot: int | None
+    folder: str | os.PathLike[str], views: list[_View], kind: str, ignore: bool, spot: int | None
 ) -> tuple[list[_View], tuple[float, ...]]:
     """Views from one position of the focal spot, and how far that is deflected: angle (rad),
     height, radius (mm)."""
@@ -317,7 +324,7 @@ def _seen_from(at_rest: ConeBeam, angle: float, height: float, radius: float) ->
     )
 
 
-def _detector(file: Any) -> dict[str, Any]:
+def _detector(file: pydicom.Dataset) -> dict[str, Any]:
     shape = _value(file, "shape").upper()
     if shape != "CYLINDRICAL":
         raise ValueError(f"its detector is {shape or 'unknown'}: only cylindrical ones are read")
@@ -337,7 +344,7 @@ def _detector(file: Any) -> dict[str, Any]:
     }
 
 
-def _pixels(file: Any, g: dict[str, Any]) -> Any:
+def _pixels(file: pydicom.Dataset, g: dict[str, Any]) -> Floats32:
     """``(rows, columns)`` float32, columns in our direction."""
     stored = np.asarray(file.pixel_array, dtype=np.float32)
     shape = (g["columns"], g["rows"])  # the files count channels as image rows

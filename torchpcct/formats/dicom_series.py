@@ -10,7 +10,7 @@ import re
 import warnings
 import zlib
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,15 @@ from torchpcct.files import VERSION, atomic_write, require_ordinary
 from torchpcct.formats.damage import check_expansion, needed, reading
 from torchpcct.formats.volume_grid import STRAIGHT, grid_from
 from torchpcct.geometry import VolumeGrid
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    import pydicom
+    from numpy.typing import ArrayLike, NDArray
+
+    from torchpcct.typing import Bools, Floats32, Ints
+
 
 _LOG = logging.getLogger(__name__)
 
@@ -90,7 +99,7 @@ def _is_text(content: bytes) -> bool:
     return bool(text) and all(c.isprintable() or c in "\r\n\t\ufeff" for c in text)
 
 
-def open_dicom(path: str | os.PathLike[str], **options: Any) -> Any:
+def open_dicom(path: str | os.PathLike[str], **options: object) -> pydicom.Dataset:
     """A DICOM data set, for a block of :func:`torchpcct.formats.damage.reading`.
 
     Args:
@@ -115,7 +124,7 @@ def open_dicom(path: str | os.PathLike[str], **options: Any) -> Any:
     return data
 
 
-def _check_inflated(path: str | os.PathLike[str], pydicom: Any) -> None:
+def _check_inflated(path: str | os.PathLike[str], pydicom: ModuleType) -> None:
     """Inflate bit by bit and throw away: pydicom would take all at once."""
     length = int(
         pydicom.filereader.read_file_meta_info(path).get("FileMetaInformationGroupLength", 0)
@@ -149,7 +158,9 @@ def check_series(folder: Path, unit: str) -> None:
         raise ValueError(f"{folder} is not empty: series in one folder mix, name a new one")
 
 
-def write_dicom(folder: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
+def write_dicom(
+    folder: str | os.PathLike[str], data: ArrayLike, grid: VolumeGrid, unit: str
+) -> None:
     """Write a CT series in HU, one file a slice, into a new or empty folder, which appears whole or
     not at all.
 
@@ -227,7 +238,7 @@ def _ds(value: float) -> str:
 
 def read_dicom(
     path: str | os.PathLike[str], unit: str | None = None
-) -> tuple[Any, VolumeGrid, str]:
+) -> tuple[Floats32, VolumeGrid, str]:
     """Data ``(z, y, x)`` float32, grid and unit (HU) of a DICOM CT series in a folder, or of one
     image's file.
 
@@ -296,7 +307,7 @@ def read_dicom(
     return data, grid, unit or "HU"
 
 
-def _hounsfield(d: Any, unit: str | None, ours: bool) -> tuple[Any, int]:
+def _hounsfield(d: pydicom.Dataset, unit: str | None, ours: bool) -> tuple[Floats32, int]:
     """Float32 pixels of an image in HU, and how many of them are padding.
 
     Raises:
@@ -324,7 +335,7 @@ def _hounsfield(d: Any, unit: str | None, ours: bool) -> tuple[Any, int]:
 _KNOWN = "; if you know that they are, Volume.load(..., unit='HU') reads them"
 
 
-def _check_ct(d: Any) -> None:
+def _check_ct(d: pydicom.Dataset) -> None:
     """Raise ``ValueError`` unless an image says that its numbers are HU; DICOM's CT need not say
     the type."""
     modality, kind = str(d.get("Modality") or "").strip(), str(d.get("RescaleType") or "").strip()
@@ -341,7 +352,7 @@ def _check_ct(d: Any) -> None:
         )
 
 
-def _padding(d: Any, stored: Any, pixels: Any, ours: bool) -> Any:
+def _padding(d: pydicom.Dataset, stored: Ints, pixels: Floats32, ours: bool) -> Bools | None:
     """Mask of what fills the square about the picture; None: the image has none.
 
     A marked value that tissue can have, too, counts where it reaches the border of the image.
@@ -372,15 +383,15 @@ def _padding(d: Any, stored: Any, pixels: Any, ours: bool) -> Any:
 class _Slice(NamedTuple):
     series: str
     orientation: tuple[float, ...]
-    position: Any
+    position: NDArray[np.float64]
     pixel: tuple[float, ...]
-    image: Any
+    image: Floats32
     thickness: float
     of: int
     """Slices of its series, 0: unknown."""
 
 
-def _joined(slices: list[_Slice]) -> tuple[Any, VolumeGrid]:
+def _joined(slices: list[_Slice]) -> tuple[Floats32, VolumeGrid]:
     series, orientation, _, pixel, image, thickness, count = slices[0]
     for other in slices[1:]:
         if other.series != series:

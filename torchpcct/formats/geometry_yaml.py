@@ -42,7 +42,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -52,12 +52,23 @@ from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam
 from torchpcct.validate import choice, number, reals, whole
 from torchpcct.vector_geometry import VectorGeometry, helical_motion
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from torchpcct.geometry import Beam
+    from torchpcct.typing import Floats
+
+
 _OWN = {
     "parallel": {"columns", "pitch", "offset"},
     "fan": {"sod", "sdd", "columns", "pitch", "offset", "detector"},
     "cone": {"sod", "sdd", "columns", "rows", "pitch", "offset", "detector"},
 }
-_KINDS: dict[str, Any] = {"parallel": ParallelBeam, "fan": FanBeam, "cone": ConeBeam}
+_KINDS: dict[str, Callable[..., Beam]] = {
+    "parallel": ParallelBeam,
+    "fan": FanBeam,
+    "cone": ConeBeam,
+}
 _VECTORS = {
     "vectors": {"vectors", "columns", "rows", "parallel"},
     "rtk": {"file", "columns", "rows", "pitch", "origin"},
@@ -68,7 +79,7 @@ _SHIFTED = ("columns", "rows")
 _HELIX = ("feed", "start")
 
 
-def geometry_of(values: Any, folder: Path = Path()) -> Geometry:
+def geometry_of(values: object, folder: Path = Path()) -> Geometry:
     """The geometry that a mapping describes; see the module's text.
 
     Args:
@@ -104,14 +115,14 @@ def geometry_of(values: Any, folder: Path = Path()) -> Geometry:
     return made if pose is None else _posed(made, pose, folder)
 
 
-def _table(name: str, value: Any, folder: Path) -> Any:
+def _table(name: str, value: object, folder: Path) -> Any:
     """Numbers as they are, or those of a ``.npy`` or text file."""
     if isinstance(value, str):
         return read_numbers(folder / value, f"a table of {name}")
     return value
 
 
-def _posed(circle: Any, pose: Any, folder: Path) -> VectorGeometry:
+def _posed(circle: Any, pose: object, folder: Path) -> VectorGeometry:
     """A circular scan whose detector is displaced and turned, or whose table travels."""
     known = (*_TURNED, *_SHIFTED, *_HELIX)
     if not isinstance(pose, Mapping) or not set(pose) <= set(known):
@@ -129,7 +140,7 @@ def _posed(circle: Any, pose: Any, folder: Path) -> VectorGeometry:
     return found.shifted(**{name: numbers[name] for name in _SHIFTED if name in numbers})
 
 
-def angles_of(value: Any, folder: Path = Path(), views: int | None = None) -> Any:
+def angles_of(value: object, folder: Path = Path(), views: int | None = None) -> Floats:
     """Angles ``(views,)`` in rad that ``angles_deg`` describes.
 
     Args:
@@ -153,7 +164,7 @@ def angles_of(value: Any, folder: Path = Path(), views: int | None = None) -> An
     return found
 
 
-def _angles(value: Any, folder: Path) -> Any:
+def _angles(value: object, folder: Path) -> Floats:
     if isinstance(value, Mapping):
         unknown = sorted(map(str, set(value) - {"start", "step", "count"}))
         if unknown or not {"step", "count"} <= set(value):
@@ -174,7 +185,7 @@ def _angles(value: Any, folder: Path) -> Any:
     return np.deg2rad(reals("angles_deg", value))
 
 
-def geometry_values(geometry: Geometry) -> dict[str, Any]:
+def geometry_values(geometry: Geometry) -> dict[str, object]:
     """The mapping that :func:`geometry_of` reads; evenly spaced angles as start, step and count."""
     if isinstance(geometry, VectorGeometry):
         rows = {} if geometry.rows is None else {"rows": geometry.rows}
@@ -193,7 +204,7 @@ def geometry_values(geometry: Geometry) -> dict[str, Any]:
     angles: Any = degrees.tolist()
     if math.isclose(float(np.abs(even - degrees).max()), 0.0, abs_tol=1e-9):
         angles = {"start": float(degrees[0]), "step": step, "count": int(degrees.size)}
-    values: dict[str, Any] = {"kind": kind, "angles_deg": angles}
+    values: dict[str, object] = {"kind": kind, "angles_deg": angles}
     for name in ("sod", "sdd", "columns", "rows", "pitch", "offset", "detector"):
         if name in _OWN[kind]:
             value = getattr(geometry, name)

@@ -3,7 +3,11 @@ nobody meant to open."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import h5py
+
 
 _MOST_LINKS = 16
 """Soft links to soft links; deeper ones lead in a circle."""
@@ -12,7 +16,7 @@ _DEEPEST = 16
 _REMEDY = "copy all into one file first (h5copy, h5repack), or open the file that it names"
 
 
-def inside(file: Any, name: str, links: int = 0) -> Any:
+def inside(file: h5py.Group, name: str, links: int = 0) -> Any:
     """Group or data set of an open HDF5 file by its path; None if there is none.
 
     Soft links within the file are followed.
@@ -51,7 +55,7 @@ def inside(file: Any, name: str, links: int = 0) -> Any:
     return at
 
 
-def _check_storage(data: Any) -> None:
+def _check_storage(data: h5py.Dataset) -> None:
     """Raise ``ValueError`` for a data set whose numbers are kept in other files."""
     if data.external:
         names = ", ".join(dict.fromkeys(str(name) for name, *_ in data.external))
@@ -63,7 +67,7 @@ def _check_storage(data: Any) -> None:
         raise ValueError(f"its {data.name} is a virtual data set, made of {names:.200}: {_REMEDY}")
 
 
-def require_inside(group: Any, depth: int = 0) -> None:
+def require_inside(group: h5py.Group, depth: int = 0) -> None:
     """Raise ``ValueError`` if anything in an HDF5 file of ours, which has no links, stands for
     another file."""
     import h5py

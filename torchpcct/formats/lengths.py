@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 
 MM = {
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1e3),
@@ -36,7 +40,7 @@ RAD = {
 """Radians of a unit, by its name in small letters."""
 
 
-def unit_text(value: Any) -> str:
+def unit_text(value: ArrayLike) -> str:
     """A unit that stands as text, bytes or an array of one of them in a file, in small letters."""
     first = np.ravel(value)[0]
     return (

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +13,12 @@ from torchpcct.formats.arrays import given_array, read_mat
 from torchpcct.formats.signed_readings import unwrapped
 from torchpcct.geometry import Geometry
 from torchpcct.scan import Scan
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from torchpcct.typing import Array
+
 
 __all__ = ["read_mat_scan"]
 
@@ -22,8 +28,8 @@ def read_mat_scan(
     geometry: Geometry,
     *,
     variable: str | None = None,
-    air: Any = None,
-    dark: Any = None,
+    air: ArrayLike | str | os.PathLike[str] | None = None,
+    dark: ArrayLike | str | os.PathLike[str] | None = None,
     **options: Any,
 ) -> Scan:
     """A scan of a MATLAB array: line integrals or, with ``air``, readings.
@@ -65,7 +71,7 @@ def read_mat_scan(
     return Scan.from_counts(readings, geometry, info=info, **held, **options)
 
 
-def _in_order(values: Any, geometry: Geometry, path: str | os.PathLike[str]) -> Any:
+def _in_order(values: Array, geometry: Geometry, path: str | os.PathLike[str]) -> Array:
     """Readings with the geometry's axes last: as they are, turned over, or with the last axis
     first."""
     shape = geometry.shape

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
@@ -20,6 +20,13 @@ from torchpcct.formats.hdf5 import inside
 from torchpcct.formats.lengths import unit_text
 from torchpcct.scan import Scan
 from torchpcct.validate import choice
+
+if TYPE_CHECKING:
+    import h5py
+    from numpy.typing import ArrayLike
+
+    from torchpcct.typing import Bools, CountsOptions, Floats, Ints
+
 
 __all__ = ["read_nexus"]
 
@@ -35,7 +42,7 @@ _SAME_TIME = 1e-3
 """Relative difference of exposures that are the same."""
 
 
-def _detectors(group: Any, depth: int = 0) -> Iterator[Any]:
+def _detectors(group: h5py.Group, depth: int = 0) -> Iterator[h5py.Group]:
     """Groups of the file itself that hold ``data`` and ``image_key``."""
     import h5py
 
@@ -50,7 +57,7 @@ def _detectors(group: Any, depth: int = 0) -> Iterator[Any]:
                 yield from _detectors(found, depth + 1)
 
 
-def holds_nexus(file: Any) -> bool:
+def holds_nexus(file: h5py.File) -> bool:
     """Whether an open HDF5 file says that it is NeXus, or holds frames with an image key."""
     classes = [
         unit_text(file[name].attrs["NX_class"])
@@ -60,13 +67,13 @@ def holds_nexus(file: Any) -> bool:
     return "nxentry" in classes or next(_detectors(file), None) is not None
 
 
-def _is_detector(group: Any) -> bool:
+def _is_detector(group: h5py.Group) -> bool:
     """Whether a group is where the frames are at home, and no view of them for plotting
     (NXdata)."""
     return unit_text(group.attrs.get("NX_class", "")) == "nxdetector"
 
 
-def _own_group(file: Any, name: str) -> bool:
+def _own_group(file: h5py.Group, name: str) -> bool:
     import h5py
 
     return isinstance(file.get(name, getlink=True), h5py.HardLink) and isinstance(
@@ -80,11 +87,11 @@ def read_nexus(
     entry: str | None = None,
     pitch: float | None = None,
     slices: slice | None = None,
-    angles_deg: Any = None,
-    air: Any = None,
-    dark: Any = None,
+    angles_deg: object = None,
+    air: ArrayLike | str | os.PathLike[str] | None = None,
+    dark: ArrayLike | str | os.PathLike[str] | None = None,
     mu_water: float | None = None,
-    **options: Any,
+    **options: Unpack[CountsOptions],
 ) -> Scan:
     """A parallel-beam scan of an NXtomo file, the mean of its flat and of its dark frames as air
     and dark.
@@ -164,7 +171,7 @@ def read_nexus(
         ).scan(mu_water, **options)
 
 
-def _detector(file: Any, entry: str | None) -> str:
+def _detector(file: h5py.File, entry: str | None) -> str:
     """Path of the detector's group."""
     import h5py
 
@@ -185,7 +192,7 @@ def _detector(file: Any, entry: str | None) -> str:
     return str(next(iter(found.values())))
 
 
-def _taken(data: Any, which: Any, rows: slice) -> Any:
+def _taken(data: h5py.Dataset, which: Bools, rows: slice) -> Any:
     """Some rows of the frames that are marked, in runs of neighbours; None: there are none."""
     at = np.flatnonzero(which)
     if not at.size:
@@ -198,7 +205,7 @@ def _taken(data: Any, which: Any, rows: slice) -> Any:
     return np.concatenate([data[run[0] : run[-1] + 1, rows] for run in runs])
 
 
-def _as_long(file: Any, detector: str, key: Any, white: Any, black: Any) -> Any:
+def _as_long(file: h5py.File, detector: str, key: Ints, white: Any, black: Any) -> Any:
     """Flat frames as they would read if they had been exposed as long as the projections."""
     given = inside(file, f"{detector}/count_time")
     times = np.zeros(0) if given is None else np.ravel(given[()]).astype(np.float64)
@@ -211,7 +218,7 @@ def _as_long(file: Any, detector: str, key: Any, white: Any, black: Any) -> Any:
     return below + (white.mean(0) - below) * (view / flat)
 
 
-def _angles(file: Any, detector: str, key: Any, given: Any) -> Any:
+def _angles(file: h5py.File, detector: str, key: Ints, given: object) -> Floats:
     """Angles of the projections in rad."""
     views = int((key == _PROJECTION).sum())
     if given is not None:

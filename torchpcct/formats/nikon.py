@@ -12,7 +12,7 @@ import os
 import re
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
@@ -24,6 +24,14 @@ from torchpcct.geometry import ConeBeam
 from torchpcct.scan import Scan
 from torchpcct.scan_file import sliced
 from torchpcct.validate import number
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import ArrayLike
+
+    from torchpcct.typing import CountsOptions
+
 
 __all__ = ["read_xtekct"]
 
@@ -47,10 +55,10 @@ def read_xtekct(
     path: str | os.PathLike[str],
     *,
     slices: slice | None = None,
-    air: Any = None,
-    dark: Any = 0.0,
+    air: ArrayLike | str | os.PathLike[str] | None = None,
+    dark: ArrayLike | str | os.PathLike[str] = 0.0,
     mu_water: float | None = None,
-    **options: Any,
+    **options: Unpack[CountsOptions],
 ) -> Scan:
     """The scan that an ``.xtekct`` file describes.
 
@@ -135,12 +143,12 @@ def read_xtekct(
     )
 
 
-def _optional(about: Any, name: str) -> float:
+def _optional(about: Mapping[str, str], name: str) -> float:
     text = about.get(name, "").strip()
     return number(name, text) if text else 0.0
 
 
-def _images(path: Path, about: Any, views: int) -> list[Path]:
+def _images(path: Path, about: Mapping[str, str], views: int) -> list[Path]:
     """The projections, in their order."""
     name, folder = (
         about.get("Name", "").strip() or path.stem,

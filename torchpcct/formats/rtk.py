@@ -9,13 +9,17 @@ from __future__ import annotations
 
 import os
 import xml.etree.ElementTree as ElementTree
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from torchpcct.formats.damage import read_text, reading
 from torchpcct.validate import number, per_axis, whole
 from torchpcct.vector_geometry import VectorGeometry
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Floats
+
 
 __all__ = ["read_rtk"]
 
@@ -24,7 +28,7 @@ _OURS = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 
 
 def read_rtk(
-    path: str | os.PathLike[str], columns: int, rows: int, pitch: Any, origin: Any = None
+    path: str | os.PathLike[str], columns: int, rows: int, pitch: object, origin: object = None
 ) -> VectorGeometry:
     """A cone beam, view by view: for ``Projector`` and ``recon.analytic.fbp.fbp``.
 
@@ -69,7 +73,9 @@ def read_rtk(
     return VectorGeometry(np.array(vectors), columns, rows)
 
 
-def _vector(p: Any, sdd: float, middle: tuple[float, float], step: tuple[float, float]) -> Any:
+def _vector(
+    p: Floats, sdd: float, middle: tuple[float, float], step: tuple[float, float]
+) -> Floats:
     inverse = np.linalg.inv(p[:, :3])
     source = -inverse @ p[:, 3]
     centre = inverse @ np.array([*middle, 1.0])

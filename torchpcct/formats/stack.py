@@ -65,7 +65,7 @@ _LINES = {"photons", "dead", "linearisation", "mu_water", "exposure_s"}
 _FILES = {"air", "dark", "dead", "flux", "photons"}
 
 
-def _is_name(value: Any) -> bool:
+def _is_name(value: object) -> bool:
     """Whether a value is the name of a file, a pattern, or a list of names."""
     listed = (
         isinstance(value, list) and len(value) > 0 and all(isinstance(each, str) for each in value)
@@ -118,7 +118,7 @@ def read_stack(
             )
         if kind == "counts" and "air" not in given:
             raise ValueError("counts need air, the readings without the object")
-    options = {
+    options: dict[str, Any] = {
         k: read_array(v, folder) if k in _FILES and _is_name(v) else v for k, v in given.items()
     }
     if "dead" in options:
@@ -134,7 +134,10 @@ def read_stack(
 
     readings = read_array(name, folder, None if slices is None else pick)
     if kind == "counts":
-        held = {"readings": readings, **{k: options[k] for k in ("air", "dark") if k in options}}
+        held: dict[str, Any] = {
+            "readings": readings,
+            **{k: options[k] for k in ("air", "dark") if k in options},
+        }
         held = unwrapped(held, str(path))
         readings = held.pop("readings")
         options |= held

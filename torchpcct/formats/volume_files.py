@@ -17,7 +17,7 @@ import re
 import shutil
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -33,6 +33,13 @@ from torchpcct.formats.dicom_series import DICOM_ENDINGS, check_series
 from torchpcct.formats.volume_grid import STRAIGHT, grid_from
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import UNITS
+
+if TYPE_CHECKING:
+    import nibabel
+    from numpy.typing import ArrayLike
+
+    from torchpcct.typing import Floats32
+
 
 __all__ = ["check_volume_name"]
 
@@ -166,7 +173,7 @@ def _unit(written: str, name: str, given: str | None) -> str:
     return written or given or "HU"
 
 
-def write_nifti(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
+def write_nifti(path: str | os.PathLike[str], data: ArrayLike, grid: VolumeGrid, unit: str) -> None:
     """Write NIfTI-1, float32, mm, RAS, with qform and sform (scanner coordinates); the unit
     stands in ``descrip``."""
     import nibabel
@@ -184,7 +191,7 @@ def write_nifti(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit:
                 image.to_stream(packed)
 
 
-def nifti_header(grid: VolumeGrid, unit: str) -> Any:
+def nifti_header(grid: VolumeGrid, unit: str) -> nibabel.Nifti1Header:
     """The header of a NIfTI-1 file of float32 voxels, which begin at byte 352."""
     import nibabel
 
@@ -203,7 +210,7 @@ def nifti_header(grid: VolumeGrid, unit: str) -> Any:
 
 def read_nifti(
     path: str | os.PathLike[str], unit: str | None = None
-) -> tuple[Any, VolumeGrid, str]:
+) -> tuple[Floats32, VolumeGrid, str]:
     """Data ``(z, y, x)`` float32, grid in mm and unit of a NIfTI volume, axes in any order or
     direction.
 
@@ -289,7 +296,9 @@ def _check_packed(path: str | os.PathLike[str]) -> None:
                 )
 
 
-def write_meta_image(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
+def write_meta_image(
+    path: str | os.PathLike[str], data: ArrayLike, grid: VolumeGrid, unit: str
+) -> None:
     """Write a MetaImage (``.mha``, float32, compressed); the unit stands in the field ``Unit``."""
     # Not by ITK, which does not look whether a full disk has taken the last of a file.
     packed = zlib.compress(np.ascontiguousarray(np.asarray(data, dtype="<f4")).tobytes(), 2)
@@ -317,7 +326,7 @@ def write_meta_image(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, 
 
 def read_meta_image(
     path: str | os.PathLike[str], unit: str | None = None
-) -> tuple[Any, VolumeGrid, str]:
+) -> tuple[Floats32, VolumeGrid, str]:
     """Data ``(z, y, x)`` float32, grid and unit of a MetaImage by SimpleITK; arguments and errors
     as :func:`read_nifti`."""
     sitk = needed("SimpleITK")

@@ -18,7 +18,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,6 +28,15 @@ from torchpcct.formats.lengths import MM
 from torchpcct.formats.volume_files import nifti_header
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import UNITS
+
+if TYPE_CHECKING:
+    from types import EllipsisType
+
+    import zarr
+    from numpy.typing import ArrayLike
+
+    from torchpcct.typing import Floats32, Reals
+
 
 SLAB_ENDINGS = (".nii", ".zarr")
 """Endings of files that are written slab by slab."""
@@ -101,7 +110,7 @@ class SlabFile:
                     self.part.write_bytes(_nifti_header(grid, unit))
                 self._note()
 
-    def write(self, data: Any) -> None:
+    def write(self, data: ArrayLike) -> None:
         """Put the next slices on the disk, float32 ``(slices, y, x)``."""
         values, first = np.ascontiguousarray(data, dtype="<f4"), self.done
         with self._writing():
@@ -126,7 +135,7 @@ class SlabFile:
             self.done += len(values)
             self._note()
 
-    def finish(self, report: Mapping[str, Any]) -> None:
+    def finish(self, report: Mapping[str, object]) -> None:
         """Give the volume its name; an OME-Zarr keeps the report. What had the name before is
         gone then."""
         with self._writing():
@@ -181,7 +190,7 @@ def _nifti_header(grid: VolumeGrid, unit: str) -> bytes:
     return bytes(nifti_header(grid, unit).binaryblock) + bytes(4)
 
 
-def _create(path: Path, grid: VolumeGrid, unit: str, chunk: int) -> Any:
+def _create(path: Path, grid: VolumeGrid, unit: str, chunk: int) -> zarr.Group:
     """An empty OME-Zarr 0.5 (https://ngff.openmicroscopy.org/0.5): one resolution, axes z, y, x."""
     zarr = needed("zarr")
     length = {} if unit == "pixel^-1" else {"unit": "millimeter"}
@@ -208,12 +217,12 @@ def _create(path: Path, grid: VolumeGrid, unit: str, chunk: int) -> Any:
     return group
 
 
-def _fill(group: Any, at: Any, values: Any) -> None:
+def _fill(group: Any, at: EllipsisType | slice, values: Reals) -> None:
     """Write voxels, every chunk of them: one that is not there is lost."""
     group["0"].with_config({"write_empty_chunks": True})[at] = values
 
 
-def _about(unit: str, report: Any = None) -> dict[str, Any]:
+def _about(unit: str, report: object = None) -> dict[str, object]:
     """What stands in the attributes beside the format's own; the digest is written by
     :func:`_seal`."""
     return {
@@ -269,7 +278,9 @@ def _check_sealed(path: Path) -> None:
         )
 
 
-def write_ome_zarr(path: str | os.PathLike[str], data: Any, grid: VolumeGrid, unit: str) -> None:
+def write_ome_zarr(
+    path: str | os.PathLike[str], data: ArrayLike, grid: VolumeGrid, unit: str
+) -> None:
     """Write a whole volume ``(z, y, x)`` as OME-Zarr 0.5: a folder, float32, mm.
 
     Raises:
@@ -325,7 +336,7 @@ def _remove_ome_zarr(folder: Path) -> None:
 
 def read_ome_zarr(
     path: str | os.PathLike[str], unit: str | None = None
-) -> tuple[Any, VolumeGrid, str]:
+) -> tuple[Floats32, VolumeGrid, str]:
     """Data ``(z, y, x)`` float32, grid in mm and unit of the first resolution of an OME-Zarr 0.4 or
     0.5.
 
@@ -384,7 +395,7 @@ def read_ome_zarr(
         return data.reshape(shape), grid, said or unit or "HU"
 
 
-def _chunk_by_chunk(array: Any, folder: Path, whole: bool) -> Any:
+def _chunk_by_chunk(array: zarr.Array, folder: Path, whole: bool) -> Floats32:
     """All numbers of a Zarr array, float32; a part that cannot be read is named.
 
     Args:

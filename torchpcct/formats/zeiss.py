@@ -8,7 +8,7 @@ source turns clockwise.
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
@@ -20,6 +20,13 @@ from torchpcct.scan import Scan
 from torchpcct.scan_file import slice_axis, sliced
 from torchpcct.validate import number
 from torchpcct.vector_geometry import VectorGeometry
+
+if TYPE_CHECKING:
+    import olefile
+    from numpy.typing import ArrayLike
+
+    from torchpcct.typing import Array, CountsOptions
+
 
 __all__ = ["read_txrm"]
 
@@ -37,10 +44,10 @@ def read_txrm(
     path: str | os.PathLike[str],
     *,
     slices: slice | None = None,
-    air: Any = None,
-    dark: Any = 0.0,
+    air: ArrayLike | str | os.PathLike[str] | None = None,
+    dark: ArrayLike | str | os.PathLike[str] = 0.0,
     mu_water: float | None = None,
-    **options: Any,
+    **options: Unpack[CountsOptions],
 ) -> Scan:
     """The scan of a ``.txrm`` file: a cone beam, or parallel rays of an instrument with optics.
 
@@ -105,7 +112,7 @@ def read_txrm(
         )
 
 
-def _type(code: Any) -> str:
+def _type(code: int) -> str:
     if int(code) not in _TYPES:
         raise ValueError(f"its images are of the unknown type {int(code)}")
     return _TYPES[int(code)]
@@ -114,10 +121,10 @@ def _type(code: Any) -> str:
 class _Streams:
     """Streams of an OLE file as numbers."""
 
-    def __init__(self, file: Any) -> None:
+    def __init__(self, file: olefile.OleFileIO) -> None:
         self.file = file
 
-    def numbers(self, name: str, kind: str, count: int = 1) -> Any:
+    def numbers(self, name: str, kind: str, count: int = 1) -> Array:
         """At least ``count`` numbers of a stream."""
         if not self.file.exists(name):
             raise ValueError(f"it has no {name}")
@@ -127,7 +134,7 @@ class _Streams:
             raise ValueError(f"its {name} holds {len(content) // size} of {count} numbers")
         return np.frombuffer(content, kind, count)
 
-    def image(self, name: str, kind: str, height: int, width: int) -> Any:
+    def image(self, name: str, kind: str, height: int, width: int) -> Array:
         return self.numbers(name, kind, height * width).reshape(height, width)
 
 

@@ -8,8 +8,6 @@ mean, not of a pixel, and hinges on the ROI.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
@@ -22,7 +20,7 @@ __all__ = ["cnr", "cnr_from_moments", "cnr_interval", "cnr_range", "sd_interval"
 Floats = NDArray[np.float64]
 
 
-def _means(name: str, values: Any) -> Floats:
+def _means(name: str, values: ArrayLike) -> Floats:
     means = np.asarray(values, dtype=np.float64)
     if means.ndim == 0 or means.shape[-1] < 2:
         raise ValueError(
@@ -34,7 +32,7 @@ def _means(name: str, values: Any) -> Floats:
 
 
 @checked
-def cnr(foreground_means: ArrayLike, background_means: ArrayLike) -> Any:
+def cnr(foreground_means: ArrayLike, background_means: ArrayLike) -> float | Floats:
     """CNR from the ROI means of every realisation.
 
     Args:
@@ -62,7 +60,7 @@ def cnr(foreground_means: ArrayLike, background_means: ArrayLike) -> Any:
 @checked
 def cnr_from_moments(
     fg_mean: ArrayLike, fg_sd: ArrayLike, bg_mean: ArrayLike, bg_sd: ArrayLike
-) -> Any:
+) -> float | Floats:
     """CNR from published means and standard deviations across realisations (any broadcastable
     shapes).
 

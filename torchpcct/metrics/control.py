@@ -28,7 +28,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -55,7 +54,9 @@ class _Regression:
     residual_left_out: Floats  # (n,)
 
     @classmethod
-    def of(cls, values: Any, controls: Any, control_mean: Any) -> _Regression:
+    def of(
+        cls, values: ArrayLike, controls: ArrayLike | None, control_mean: ArrayLike | None
+    ) -> _Regression:
         y = np.asarray(values, dtype=np.float64)
         if y.ndim != 1:
             raise ValueError(f"values must be (realisations,), got the shape {y.shape}")
@@ -103,7 +104,7 @@ class _Regression:
         """βᵀΣβ + σ_e², of all and with each left out."""
         n, m = self.left_out.shape[0], self.left_out.shape[1] - 1
 
-        def total(slopes: Floats, residual: Any, count: int) -> Any:
+        def total(slopes: Floats, residual: float | Floats, count: int) -> Floats:
             # The error of β adds σ_e² m / (n − m − 2) to βᵀΣβ on average: taken off.
             share = (1.0 - m / (count - m - 2)) / (count - m - 1)
             return np.einsum("...i,ij,...j->...", slopes, covariance, slopes) + residual * share
@@ -114,7 +115,7 @@ class _Regression:
         )
 
 
-def _known_covariance(value: Any, count: int) -> Floats:
+def _known_covariance(value: ArrayLike | None, count: int) -> Floats:
     c = np.asarray(value, dtype=np.float64)
     c = c.reshape(1, 1) if c.ndim == 0 and count == 1 else c
     if c.shape != (count, count) or not np.isfinite(c).all() or not np.allclose(c, c.T, rtol=1e-6):

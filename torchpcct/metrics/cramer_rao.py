@@ -15,7 +15,6 @@ All amplitudes of the information matrix count as unknown. A tissue whose value 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -37,7 +36,7 @@ float64."""
 
 @checked
 def information_matrix(
-    maps: Sequence[Any] | Tensor, inverse_variance: ArrayLike, *, scale: float = 1.0
+    maps: Sequence[ArrayLike] | Tensor, inverse_variance: ArrayLike, *, scale: float = 1.0
 ) -> Floats:
     """Fisher information of the tissue amplitudes, ``F_ij = scale² Σ a_i w a_j``.
 

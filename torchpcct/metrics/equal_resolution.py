@@ -33,7 +33,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,10 @@ from scipy import fft, stats
 from torchpcct.metrics.half_split import HalfSplit
 from torchpcct.metrics.intervals import Estimate
 from torchpcct.validate import checked
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 
 __all__ = ["EqualNoise", "noise_at_equal_resolution"]
 
@@ -109,7 +113,7 @@ class EqualNoise:
 
 @checked
 def noise_at_equal_resolution(
-    method: HalfSplit, reference: HalfSplit, spacing: Sequence[float], region: Any = None
+    method: HalfSplit, reference: HalfSplit, spacing: Sequence[float], region: object = None
 ) -> EqualNoise:
     """Compare the noise of a method with that of the reference, filtered to the method's
     resolution.
@@ -210,7 +214,7 @@ class _Cells:
             found[layer] += np.bincount(self._ring, plane.ravel(), self.rings)
         return found
 
-    def spread(self, cells: Any) -> Any:
+    def spread(self, cells: ArrayLike) -> Floats:
         """A value for every sample."""
         return np.asarray(cells)[self._layer][:, self._ring].reshape(
             len(self._layer), *self.plane.shape

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,6 +15,10 @@ from torch import Tensor
 from torchpcct.metrics.resolution import first_below
 from torchpcct.scan import Scan
 from torchpcct.validate import checked
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 
 __all__ = ["HalfSplit", "half_split"]
 
@@ -38,7 +42,7 @@ class HalfSplit:
         """Their mean: of a linear method, the volume of the whole scan."""
         return (self.first + self.second) / 2
 
-    def noise(self, region: Any = None) -> float:
+    def noise(self, region: ArrayLike | None = None) -> float:
         """Standard deviation of the WHOLE scan's noise in a region: that of half the difference.
 
         Exact for linear methods. For others it is the noise that remains at half the dose over √2:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,10 @@ from scipy import stats
 from scipy.special import ndtr, ndtri
 
 from torchpcct.validate import checked, coverage, whole
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 
 __all__ = ["Estimate", "Jackknifed", "combined"]
 
@@ -51,7 +55,7 @@ def leave_one_out(realizations: int) -> NDArray[np.int64]:
 
 
 def bca_interval(
-    value: float, draws: Any, jackknife: Any, level: float = 0.95
+    value: float, draws: ArrayLike, jackknife: ArrayLike, level: float = 0.95
 ) -> tuple[float, float]:
     """Bias-corrected and accelerated bootstrap interval (Efron 1987).
 
@@ -143,7 +147,7 @@ def combined(function: Callable[..., Any], *figures: Jackknifed | float) -> Jack
     return Jackknifed(value, left_out)
 
 
-def log_of_sum(parts: Any, lost: int = 0) -> Jackknifed:
+def log_of_sum(parts: ArrayLike, lost: int = 0) -> Jackknifed:
     """ln(Σ parts / (n − lost)) of non-negative parts, one for each realisation.
 
     Args:

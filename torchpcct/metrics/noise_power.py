@@ -10,7 +10,6 @@ between neighbouring frequencies (ICRU Report 87).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +74,7 @@ class NoisePower:
 
 
 @checked
-def noise_power_spectrum(realizations: Any, spacing: float | tuple[float, ...]) -> NoisePower:
+def noise_power_spectrum(realizations: object, spacing: float | tuple[float, ...]) -> NoisePower:
     """Noise power spectrum of an ensemble.
 
     Args:

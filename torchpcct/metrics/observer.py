@@ -13,7 +13,6 @@ radial in mm, so that they serve a plane or a volume of any spacing.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -159,7 +158,7 @@ def hotelling_scores(present: ArrayLike, absent: ArrayLike) -> tuple[Floats, Flo
     return ((a - middle) * w).sum(1), ((b - middle) * w).sum(1)
 
 
-def _templates(scatter: Any, difference: Any) -> Floats:
+def _templates(scatter: Floats, difference: Floats) -> Floats:
     """``K⁻¹ Δ`` for stacks, scaled by the channels' SDs so that their units do not matter."""
     sd = np.sqrt(np.einsum("...ii->...i", scatter))
     if not (sd > 0).all():

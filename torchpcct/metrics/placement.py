@@ -11,7 +11,7 @@ table its SD is 1.7 to 2.3 times that of the core, so it must be the smaller one
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import ndimage
@@ -20,6 +20,10 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import RoiMean
 from torchpcct.scene import Scene
 from torchpcct.validate import checked
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Bools, Floats
+
 
 __all__ = ["RoiPair", "RoiRule", "place_rois"]
 
@@ -46,8 +50,8 @@ class RoiRule:
 class RoiPair:
     """Boolean masks of the axial image, ``(1, y, x)``, and their grid."""
 
-    foreground: Any
-    background: Any
+    foreground: Bools
+    background: Bools
     image: VolumeGrid
     rule: RoiRule
 
@@ -57,7 +61,7 @@ class RoiPair:
             grid, self.image, self.background
         )
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """Sizes of the ROIs for the report."""
         pixel = self.image.spacing[1] * self.image.spacing[2]
         return {
@@ -130,7 +134,7 @@ def _placed(scene: Scene, image: VolumeGrid, rule: RoiRule) -> RoiPair:
     return RoiPair(foreground, background, image, rule)
 
 
-def _depth(mask: Any, image: VolumeGrid) -> Any:
+def _depth(mask: Bools, image: VolumeGrid) -> Floats:
     """Distance in mm to the mask's edge; in the plane where the image has one slice."""
     if image.shape[0] == 1:
         return ndimage.distance_transform_edt(mask[0], sampling=image.spacing[1:])[None]

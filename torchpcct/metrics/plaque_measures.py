@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,6 +35,12 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.resolution import first_below
 from torchpcct.metrics.roi import as_array
 from torchpcct.validate import checked
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from torchpcct.typing import Ints
+
 
 __all__ = ["PlaqueSegmentation", "dice", "lumen_area", "segment_plaque"]
 
@@ -253,7 +259,7 @@ def dice(a: ArrayLike, b: ArrayLike) -> float:
     return 2.0 * int((first & second).sum()) / total if total else math.nan
 
 
-def _slice(image: Any, grid: VolumeGrid) -> tuple[Floats, VolumeGrid]:
+def _slice(image: Tensor | ArrayLike, grid: VolumeGrid) -> tuple[Floats, VolumeGrid]:
     """The image as ``(y, x)`` float64, and its 2-D grid."""
     x = as_array(image)
     if grid.ndim == 3 and grid.shape[0] != 1:
@@ -271,7 +277,7 @@ def _area(points: Floats) -> float:
     return abs(float((p[:-1, 0] * p[1:, 1] - p[1:, 0] * p[:-1, 1]).sum())) / 2
 
 
-def _largest(labels: Any) -> Mask:
+def _largest(labels: Ints) -> Mask:
     """The label with the most pixels; nothing where all are 0."""
     sizes = np.bincount(labels.ravel())
     if sizes.size < 2:

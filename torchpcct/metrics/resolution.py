@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -225,7 +224,7 @@ def _step(profile: Floats) -> float:
     return float(profile[-n:].mean() - profile[:n].mean())
 
 
-def _spread_of(left_out: Any) -> Any:
+def _spread_of(left_out: Floats) -> Floats:
     """Jackknife standard error of figures with one sector left out each."""
     n = len(left_out)
     return np.sqrt((n - 1) / n * np.square(left_out - left_out.mean(0)).sum(0))

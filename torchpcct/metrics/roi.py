@@ -9,7 +9,7 @@ It is also what the exact variance of a linear reconstruction needs (one adjoint
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -18,13 +18,17 @@ from torch import Tensor
 
 from torchpcct.geometry import VolumeGrid
 
+if TYPE_CHECKING:
+    from torchpcct.typing import Bools
+
+
 __all__ = ["RoiMean"]
 
 PROTOCOL_PIXEL_MM = 0.035
 PROTOCOL_PIXELS = 256
 
 
-def as_array(image: Any) -> Any:
+def as_array(image: object) -> Any:
     """An image, tensor on any device or array, as a NumPy array of its own dtype."""
     return image.detach().cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
 
@@ -102,7 +106,7 @@ class RoiMean:
 
     grid: VolumeGrid
     image: VolumeGrid
-    mask: Any
+    mask: Bools
 
     def __post_init__(self) -> None:
         mask = np.asarray(self.mask, dtype=bool)

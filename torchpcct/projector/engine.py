@@ -7,7 +7,7 @@ import itertools
 import math
 import weakref
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -51,7 +51,7 @@ class Engine:
         self.handle = next(_HANDLES)
         ENGINES[self.handle] = self
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: dict[str, object]) -> None:
         """Of a copy, or in another process: a handle of its own."""
         self.__dict__.update(state)
         self._enter()

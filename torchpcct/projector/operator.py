@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 import torch
@@ -22,7 +22,12 @@ from torchpcct.switches import undisturbed, unswitched
 from torchpcct.vector_geometry import VectorGeometry
 
 if TYPE_CHECKING:
+    import pylops
+    from deepinv.physics import LinearPhysics
+    from numpy.typing import ArrayLike, DTypeLike
     from scipy.sparse.linalg import LinearOperator
+
+    from torchpcct.typing import Reals
 
 __all__ = ["Operator", "Projector"]
 
@@ -108,7 +113,7 @@ class Operator(nn.Module):
             kept = self.__dict__["_norm"] = (tolerance, value)
         return cast(float, kept[1])
 
-    def as_scipy(self, dtype: Any = np.float32) -> LinearOperator:
+    def as_scipy(self, dtype: DTypeLike = np.float32) -> LinearOperator:
         """A :class:`scipy.sparse.linalg.LinearOperator` on flattened arrays, for SciPy's solvers.
 
         Args:
@@ -122,7 +127,7 @@ class Operator(nn.Module):
         if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
             raise TypeError(f"dtype must be float32 or float64, got {dtype!r}")
 
-        def columns(operator: Operator, values: Any) -> Any:
+        def columns(operator: Operator, values: Reals) -> Reals:
             # Columns of a matrix are a batch.
             batch = np.ascontiguousarray(
                 np.asarray(values, dtype=dtype).reshape(values.shape[0], -1).T
@@ -140,7 +145,7 @@ class Operator(nn.Module):
             dtype=dtype,
         )
 
-    def as_pylops(self, dtype: Any = np.float32) -> Any:
+    def as_pylops(self, dtype: DTypeLike = np.float32) -> pylops.LinearOperator:
         """A ``pylops.LinearOperator`` on flattened arrays; see :meth:`as_scipy`.
 
         Raises:
@@ -150,7 +155,7 @@ class Operator(nn.Module):
 
         return pylops.aslinearoperator(self.as_scipy(dtype))
 
-    def as_deepinv(self) -> Any:
+    def as_deepinv(self) -> LinearPhysics:
         """A ``deepinv.physics.LinearPhysics``: differentiable, on batches ``(batch, …, *shape)``.
 
         Raises:
@@ -159,6 +164,13 @@ class Operator(nn.Module):
         from deepinv.physics import LinearPhysics
 
         return LinearPhysics(A=lambda x, **_: self(x), A_adjoint=lambda y, **_: self.T(y))
+
+
+class _Maps(Protocol):
+    """What a linear map keeps for its derivatives."""
+
+    forward_map: Linear
+    transpose_map: Linear
 
 
 class _Linear(torch.autograd.Function):
@@ -171,20 +183,20 @@ class _Linear(torch.autograd.Function):
             return forward(x)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    def setup_context(ctx: _Maps, inputs: tuple[Tensor, Linear, Linear], output: Tensor) -> None:
         _, ctx.forward_map, ctx.transpose_map = inputs
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Any) -> Any:
-        return _Linear.apply(gradients[0], ctx.transpose_map, ctx.forward_map), None, None
+    def backward(ctx: _Maps, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        return apply_linear(gradients[0], ctx.transpose_map, ctx.forward_map), None, None
 
     @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Any:
-        return _Linear.apply(tangents[0], ctx.forward_map, ctx.transpose_map)
+    def jvp(ctx: _Maps, *tangents: Tensor) -> Tensor:
+        return apply_linear(tangents[0], ctx.forward_map, ctx.transpose_map)
 
     @staticmethod
     def vmap(
-        info: Any, in_dims: tuple[Any, ...], x: Tensor, forward: Linear, transpose: Linear
+        info: object, in_dims: tuple[int, None, None], x: Tensor, forward: Linear, transpose: Linear
     ) -> tuple[Tensor, int]:
         # Leading dimensions are batch dimensions already.
         return _Linear.apply(x.movedim(in_dims[0], 0), forward, transpose), 0
@@ -214,11 +226,18 @@ def _shape(x: Tensor, engine: int, transposed: bool) -> Tensor:
     return x.new_empty((*x.shape[: x.dim() - len(inner)], *outer))
 
 
-def _note(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+class _TracedPass(Protocol):
+    """What a traced pass keeps for its derivative."""
+
+    engine: int
+    transposed: bool
+
+
+def _note(ctx: _TracedPass, inputs: tuple[Tensor, int, bool], output: Tensor) -> None:
     _, ctx.engine, ctx.transposed = inputs
 
 
-def _back(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+def _back(ctx: _TracedPass, gradient: Tensor) -> tuple[Tensor, None, None]:
     return _traced(gradient, ctx.engine, not ctx.transposed), None, None
 
 
@@ -288,7 +307,7 @@ class Projector(Operator):
         geometry: Geometry | ParametricGeometry,
         grid: VolumeGrid,
         window: DetectorWindow | None = None,
-        motion: Any = None,
+        motion: ArrayLike | None = None,
     ) -> None:
         super().__init__(_engine(geometry, grid, window, motion))
         self.geometry = geometry.base if isinstance(geometry, ParametricGeometry) else geometry
@@ -321,7 +340,12 @@ class Projector(Operator):
         return arrays + self._engine.workspace(batch, item, torch.device(device).type)
 
 
-def _engine(geometry: Any, grid: Any, window: Any, motion: Any) -> Engine | PosedEngine:
+def _engine(
+    geometry: Geometry | ParametricGeometry,
+    grid: VolumeGrid,
+    window: DetectorWindow | None,
+    motion: Tensor | ArrayLike | None,
+) -> Engine | PosedEngine:
     if not _is_free(motion) and not isinstance(geometry, ParametricGeometry):
         return Engine(_tables(geometry, grid, window, motion))
     scan = geometry if isinstance(geometry, ParametricGeometry) else with_parameters(geometry)
@@ -330,14 +354,19 @@ def _engine(geometry: Any, grid: Any, window: Any, motion: Any) -> Engine | Pose
     return PosedEngine(scan, grid, window, motion)
 
 
-def _is_free(motion: Any) -> bool:
+def _is_free(motion: object) -> bool:
     """Whether somebody wants derivatives by a motion, backward or forward."""
     if not isinstance(motion, Tensor):
         return False
     return motion.requires_grad or torch.autograd.forward_ad.unpack_dual(motion).tangent is not None
 
 
-def _tables(geometry: Any, grid: Any, window: Any, motion: Any) -> Tables | VectorTables:
+def _tables(
+    geometry: Geometry,
+    grid: VolumeGrid,
+    window: DetectorWindow | None,
+    motion: ArrayLike | None,
+) -> Tables | VectorTables:
     if not isinstance(geometry, VectorGeometry):
         return Tables(geometry, grid, window, motion)
     if window is not None:
@@ -355,7 +384,7 @@ def _tables(geometry: Any, grid: Any, window: Any, motion: Any) -> Tables | Vect
     )
 
 
-def _checked(x: Any, inner: tuple[int, ...], name: str, operator: str) -> Tensor:
+def _checked(x: object, inner: tuple[int, ...], name: str, operator: str) -> Tensor:
     """``x`` in float32 or float64."""
     if not isinstance(x, Tensor):
         raise TypeError(

@@ -10,7 +10,7 @@ poses says nothing.
 from __future__ import annotations
 
 import math
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol, cast
 
 import numpy as np
 import torch
@@ -23,6 +23,12 @@ from torchpcct.projector.poses import ParametricGeometry, moved_poses, windowed_
 from torchpcct.projector.rays import check_pair, check_source
 from torchpcct.switches import unswitched
 from torchpcct.vector_geometry import VectorGeometry
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from torchpcct.projector.cpu.vector_passes import PosePasses
+    from torchpcct.typing import Reals
 
 
 class PosedEngine:
@@ -73,7 +79,7 @@ class PosedEngine:
             rows, columns = window.rows, window.columns
         self._readings = (base.views, rows, columns)
         self._middle = middle
-        self._kept: Any = None
+        self._kept: PosePasses | None = None
         if not base.parallel:
             with torch.no_grad():
                 place = self.poses()[:, 0, : grid.ndim].flip(1).numpy()
@@ -118,7 +124,7 @@ class PosedEngine:
         return poses
 
     @property
-    def passes(self) -> Any:
+    def passes(self) -> PosePasses:
         if self._kept is None:
             from torchpcct.projector.cpu.vector_passes import PosePasses
 
@@ -173,15 +179,28 @@ def _check_motion(motion: Tensor, views: int, axes: int) -> None:
         )
 
 
-def _array(x: Tensor) -> Any:
+def _array(x: Tensor) -> Reals:
     return np.ascontiguousarray(x.detach().numpy())
 
 
-def _run(method: Any, *args: Tensor, like: Tensor) -> Tensor:
+def _run(method: Callable[..., Reals], *args: Tensor, like: Tensor) -> Tensor:
     announce_compilation()
     with unswitched():
         found = torch.from_numpy(method(*(_array(x) for x in args)))
         return found.to(like.dtype)
+
+
+class _PassContext(Protocol):
+    """What the passes keep for their derivatives."""
+
+    engine: PosedEngine
+    transposed: bool
+    saved_tensors: tuple[Tensor, ...]
+    needs_input_grad: tuple[bool, ...]
+
+    def save_for_backward(self, *tensors: Tensor) -> None: ...
+
+    def save_for_forward(self, *tensors: Tensor) -> None: ...
 
 
 class _Pass(torch.autograd.Function):
@@ -193,13 +212,15 @@ class _Pass(torch.autograd.Function):
         return _run(passes.adjoint if transposed else passes.forward, poses, x, like=x)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    def setup_context(
+        ctx: _PassContext, inputs: tuple[Tensor, Tensor, PosedEngine, bool], output: Tensor
+    ) -> None:
         x, poses, ctx.engine, ctx.transposed = inputs
         ctx.save_for_backward(x, poses)
         ctx.save_for_forward(x, poses)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Any) -> Any:
+    def backward(ctx: _PassContext, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         x, poses = ctx.saved_tensors
         (gradient,) = gradients
         by_x = by_poses = None
@@ -211,10 +232,10 @@ class _Pass(torch.autograd.Function):
         return by_x, by_poses, None, None
 
     @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Any:
+    def jvp(ctx: _PassContext, *tangents: Tensor) -> Tensor | float:
         x, poses = ctx.saved_tensors
         by_x, by_poses = tangents[:2]
-        out: Any = 0.0
+        out: Tensor | float = 0.0
         if by_x is not None:
             out = _Pass.apply(by_x, poses, ctx.engine, ctx.transposed)
         if by_poses is not None:
@@ -240,13 +261,15 @@ class _ByPoses(torch.autograd.Function):
         return _run(engine.passes.gradient, poses, volume, readings, like=poses)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    def setup_context(
+        ctx: _PassContext, inputs: tuple[Tensor, Tensor, Tensor, PosedEngine], output: Tensor
+    ) -> None:
         volume, readings, poses, ctx.engine = inputs
         ctx.save_for_backward(volume, readings, poses)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Any) -> Any:
+    def backward(ctx: _PassContext, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         volume, readings, poses = ctx.saved_tensors
         (along,) = gradients
         by_volume = by_readings = None
@@ -262,11 +285,11 @@ class _OnceOnly(torch.autograd.Function):
     where only those come by who do."""
 
     @staticmethod
-    def forward(ctx: Any, poses: Tensor) -> Tensor:
+    def forward(ctx: object, poses: Tensor) -> Tensor:
         return poses.view_as(poses)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Any) -> Any:
+    def backward(ctx: object, *gradients: Tensor) -> NoReturn:
         raise NotImplementedError(
             "readings are piecewise linear in the geometry: a second derivative by it says "
             "nothing. Use the first (Gauss-Newton), or detach the geometry's tensors where you "

@@ -9,7 +9,7 @@ poses.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -19,6 +19,10 @@ from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import Geometry, ParallelBeam
 from torchpcct.validate import checked, choice
 from torchpcct.vector_geometry import VectorGeometry
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Floats
+
 
 __all__ = ["PARAMETERS", "ParametricGeometry", "with_parameters"]
 
@@ -118,7 +122,7 @@ def _with_angles(base: Any, angles: Tensor) -> Any:
 
 
 @checked
-def with_parameters(geometry: Geometry, **parameters: Any) -> ParametricGeometry:
+def with_parameters(geometry: Geometry, **parameters: Tensor | float) -> ParametricGeometry:
     """A scan some of whose numbers are tensors, for ``Projector(with_parameters(…), grid)``:
     readings then have gradients by them.
 
@@ -164,7 +168,7 @@ def with_parameters(geometry: Geometry, **parameters: Any) -> ParametricGeometry
     return ParametricGeometry(geometry, given)
 
 
-def _tensor(name: str, value: Any, geometry: Geometry) -> Tensor:
+def _tensor(name: str, value: object, geometry: Geometry) -> Tensor:
     try:
         tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError):
@@ -213,7 +217,7 @@ def _refuse(geometry: Geometry, given: Mapping[str, Tensor]) -> None:
 def _of_circle(geometry: Any, given: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Source, centre, u and v ``(views, 3)`` of a circular scan."""
 
-    def of(name: str, own: Any) -> Tensor:
+    def of(name: str, own: float | Floats) -> Tensor:
         value = given.get(name)
         return torch.tensor(own, dtype=torch.float64) if value is None else value
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,7 +82,7 @@ class Rays:
         return replace(self, source=source, foot_z=self.foot_z - shift[:, 0])
 
 
-def check_pair(geometry: Any, grid: Any, window: Any) -> None:
+def check_pair(geometry: Geometry, grid: object, window: object) -> None:
     """Refuse a geometry, grid and window that do not belong together.
 
     Raises:

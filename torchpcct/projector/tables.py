@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,10 @@ from torchpcct.projector.rays import (
     split,
 )
 from torchpcct.vector_geometry import VectorGeometry, split_motion
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 
 LAYER_SHIFT = 0.04
 """Row edges may move by this part of the blur between two depth layers (see layer_spacing)."""
@@ -42,7 +46,7 @@ class Tables:
         geometry: Geometry,
         grid: VolumeGrid,
         window: DetectorWindow | None = None,
-        motion: Any = None,
+        motion: ArrayLike | None = None,
     ) -> None:
         check_pair(geometry, grid, window)
         # Symmetric views share their work only if all of the detector is read and nothing moves.

@@ -6,7 +6,6 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -178,7 +177,9 @@ def behind_filters(
 ) -> Floats:
     """Photons ``(angles, E)`` that pass flat slabs, obliquely, and bowties; ``photons``
     broadcasts to that shape."""
-    slab: Any = sum((m.attenuation(energies_kev) * t for m, t in flat), np.zeros(energies_kev.size))
+    slab: Floats = sum(
+        (m.attenuation(energies_kev) * t for m, t in flat), np.zeros(energies_kev.size)
+    )
     photons = photons * np.exp(-np.multiply.outer(1.0 / np.cos(fan_angles_rad), slab))
     for bowtie in bowties:
         photons = photons * bowtie.transmission(fan_angles_rad, energies_kev)

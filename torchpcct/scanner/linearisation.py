@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -23,6 +23,10 @@ from torch import Tensor
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.threads import run
 from torchpcct.validate import number, numbers, reals, whole
+
+if TYPE_CHECKING:
+    import h5py
+
 
 __all__ = ["WaterLinearisation"]
 
@@ -240,14 +244,14 @@ class WaterLinearisation:
         """Derivative of :meth:`apply`: what it multiplies the standard deviation of ``p`` by."""
         return self._evaluate(p, window, slope=True)
 
-    def save(self, group: Any) -> None:
+    def save(self, group: h5py.Group) -> None:
         """Write into an HDF5 group."""
         group["coefficients"] = self.coefficients
         group["scale"] = self.scale
         group.attrs["mu_ref_per_mm"] = self.mu_ref
 
     @classmethod
-    def load(cls, group: Any) -> WaterLinearisation:
+    def load(cls, group: h5py.Group) -> WaterLinearisation:
         """Read what :meth:`save` wrote."""
         return cls(
             group["coefficients"][()], group["scale"][()], float(group.attrs["mu_ref_per_mm"])

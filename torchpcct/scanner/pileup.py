@@ -16,7 +16,7 @@ a τ behind a body.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -27,6 +27,10 @@ from torch import Tensor
 from torchpcct.scanner.detector import SiliconDetector
 from torchpcct.scene.materials import MATERIALS
 from torchpcct.validate import checked
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Ints
+
 
 __all__ = ["PileUpMap", "pulse_heights", "recorded_rates"]
 
@@ -178,12 +182,12 @@ class PileUpMap:
         resampled.setflags(write=False)
         return cls(resampled, scale, np.interp(np.arange(columns), nodes, np.arange(nodes.size)))
 
-    def at(self, line_integrals: Any, columns: Any) -> Floats:
+    def at(self, line_integrals: ArrayLike, columns: Ints | slice) -> Floats:
         """ln(recorded / true) of every bin, ``(bins, ...)``, for true line integrals and
         detector columns."""
         return self._look_up(self.log_ratio[:-1], line_integrals, columns)
 
-    def _look_up(self, table: Floats, line_integrals: Any, columns: Any) -> Floats:
+    def _look_up(self, table: Floats, line_integrals: ArrayLike, columns: Ints | slice) -> Floats:
         p, node = np.broadcast_arrays(
             np.asarray(line_integrals, dtype=np.float64), self.node[columns]
         )
@@ -196,7 +200,7 @@ class PileUpMap:
         far = table[:, right, low] * (1 - part) + table[:, right, low + 1] * part
         return np.asarray(near * (1 - share) + far * share)
 
-    def apply(self, readings: Tensor, air: Tensor, columns: Any) -> Tensor:
+    def apply(self, readings: Tensor, air: Tensor, columns: Ints | slice) -> Tensor:
         """Recorded for true expected readings.
 
         Args:
@@ -212,7 +216,7 @@ class PileUpMap:
         ratio = torch.from_numpy(self.at(torch.nan_to_num(p, posinf=self.scale).numpy(), columns))
         return readings * ratio.exp().to(readings.dtype)
 
-    def shift(self, line_integrals: Any) -> Floats:
+    def shift(self, line_integrals: ArrayLike) -> Floats:
         """What pile-up adds to the line integrals of the summed counts in a calibration,
         ``(columns, samples)``."""
         columns, total = np.arange(self.node.size)[:, None], self.log_ratio[-1:]

@@ -8,7 +8,6 @@ leave open is a named constant here.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from torchpcct.geometry import ConeBeam, full_turn
 from torchpcct.scanner.detector import Scintillator, SiliconDetector
@@ -44,7 +43,7 @@ QUARTER_OFFSET_COLUMNS = 0.25
 _BOWTIES = ("large", "roi", "large+roi", "none")
 
 
-def _bowties(name: Any, sod: float) -> tuple[Bowtie, ...]:
+def _bowties(name: object, sod: float) -> tuple[Bowtie, ...]:
     if isinstance(name, Bowtie):
         return (name,)
     if not isinstance(name, str):
@@ -64,7 +63,7 @@ def pcct(
     views: int = PCCT_VIEWS,
     mode: str = "counting",
     *,
-    bowtie: Any = "large",
+    bowtie: object = "large",
     kvp: float = 100.0,
     current_ma: float = 1000.0,
     rows: int = 40,
@@ -116,7 +115,7 @@ def pcct(
 def eid(
     views: int = EID_VIEWS,
     *,
-    bowtie: Any = "large",
+    bowtie: object = "large",
     kvp: float = 100.0,
     current_ma: float = 1000.0,
     rows: int = 64,

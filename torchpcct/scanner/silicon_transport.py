@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -176,7 +175,7 @@ def follow(
     alive = place[:, 1] < stack.sheet_pitch_mm - stack.foil_mm  # the others meet a foil edge-on
     ends = detector.dead_layer_mm + np.cumsum(detector.segment_mm)
     table = _Attenuation()
-    found: list[tuple[Any, ...]] = []
+    found: list[tuple[Ints | Floats, ...]] = []
     for order in range(_MOST_INTERACTIONS):
         index, place, direction, energy = (
             index[alive],
@@ -269,7 +268,7 @@ def _fly(
     stack: Stack,
     depth: float,
     table: _Attenuation,
-    rng: Any,
+    rng: np.random.Generator,
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """To the next interaction in silicon: places, and whether there is one."""
     place = place.copy()
@@ -316,7 +315,7 @@ def _fly(
         lost[passed[out]] = True
 
 
-def _scatter(energy: Floats, rng: Any) -> tuple[Floats, Floats]:
+def _scatter(energy: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Energy after Compton scattering and cosine of the angle: rejection from the flat cosine."""
     cosine, ratio = np.empty(energy.size), np.empty(energy.size)
     left = np.arange(energy.size)
@@ -407,7 +406,7 @@ def _further(detector: TransportedSilicon) -> Floats:
     first = d.order == 0
     shape = (_NODES_KEV.size, _HEIGHTS.size)
 
-    def histogram(photon: NDArray[Any], height: NDArray[Any]) -> Floats:
+    def histogram(photon: Ints, height: Floats) -> Floats:
         place = np.minimum((height / _HEIGHT_KEV).astype(np.int64), _HEIGHTS.size - 1)
         flat = np.bincount(node[photon] * _HEIGHTS.size + place, minlength=shape[0] * shape[1])
         return flat.reshape(shape).astype(np.float64)

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.scene.materials import MATERIALS, Material
 from torchpcct.validate import number, numbers, reals
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
 
 __all__ = ["Source", "Spectrum"]
 
@@ -139,7 +143,9 @@ class Source:
             )
 
     @classmethod
-    def tabulated(cls, energies_kev: Any, fluence: Any, **changes: Any) -> Source:
+    def tabulated(
+        cls, energies_kev: Iterable[float], fluence: Iterable[float], **changes: Any
+    ) -> Source:
         """A tube with a measured or tabulated spectrum.
 
         Args:
@@ -183,7 +189,7 @@ class Source:
         return _spectrum(self.kvp, self.anode_angle_deg, self.filtration, self.output, width)
 
 
-def _table(value: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _table(value: object) -> tuple[tuple[float, ...], tuple[float, ...]]:
     if not isinstance(value, tuple | list | np.ndarray) or len(value) != 2:
         raise TypeError(f"table must be a pair, energies in keV and fluences, got {value!r:.60}")
     energies, fluence = (reals("table", v) for v in value)

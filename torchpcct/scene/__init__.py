@@ -7,7 +7,7 @@ voxels, for reference images only. :mod:`~.voxels` makes a scene of a CT volume.
 :mod:`~torchpcct.scene.plaque`, :mod:`~torchpcct.scene.phantoms`.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from torchpcct.scene.bodies import Box, Ellipsoid, EllipticCylinder, Shape, rotation_matrix
 from torchpcct.scene.motion import SinusoidalMotion
@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     # The chord kernels need numba: loaded on first use, so that importing the package stays quick.
     if name == "chord_lengths":
         from torchpcct.scene.chords import chord_lengths

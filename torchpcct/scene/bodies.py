@@ -10,12 +10,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torchpcct.validate import checked, number, numbers, reals
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
 
 __all__ = ["Box", "Ellipsoid", "EllipticCylinder", "Shape", "rotation_matrix"]
 
@@ -45,7 +49,7 @@ def rotation_matrix(axis: ArrayLike, angle: float) -> Floats:
     return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
 
 
-def _rotation(value: Any) -> Matrix:
+def _rotation(value: ArrayLike) -> Matrix:
     if np.ndim(value) == 0:
         angle = number("rotation", value)
         m = rotation_matrix((0.0, 0.0, 1.0), angle)
@@ -97,7 +101,7 @@ class Shape:
         ValueError, TypeError: a value out of range or of the wrong kind; the message names it.
     """
 
-    position: Any = (0.0, 0.0, 0.0)
+    position: Sequence[float] = (0.0, 0.0, 0.0)
     rotation: Any = 0.0
 
     def __post_init__(self) -> None:

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,7 +53,7 @@ _SLACK = 1.0 + 1e-9
 grazes it."""
 
 
-def _slope_limit(shape: Any) -> float:
+def _slope_limit(shape: BulgedTube | NarrowedTube) -> float:
     """Largest ``|dz|`` for which ``h`` is convex along the ray and the phase stays in the series'
     range.
 
@@ -152,7 +151,7 @@ def pack(shapes: Sequence[Shape]) -> tuple[NDArray[np.int64], NDArray[np.float64
 
 
 @checked
-def chord_lengths(scene: Any, origins: ArrayLike, directions: ArrayLike) -> NDArray[np.float64]:
+def chord_lengths(scene: object, origins: ArrayLike, directions: ArrayLike) -> NDArray[np.float64]:
     """Length that straight lines run inside each shape.
 
     Args:

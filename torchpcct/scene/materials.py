@@ -17,12 +17,16 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.validate import checked, number, reals
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 
 __all__ = [
     "MATERIALS",
@@ -83,7 +87,7 @@ def _atomic_mass(element: str) -> float:
     return float(xraydb.atomic_mass(element))
 
 
-def _energies(energies_kev: Any) -> Floats:
+def _energies(energies_kev: ArrayLike) -> Floats:
     energies = np.array(reals("energies_kev", energies_kev), order="C")
     if not energies.size:
         raise ValueError("energies_kev is empty: give one energy or more")
@@ -160,10 +164,10 @@ class Material:
     def __hash__(self) -> int:
         return hash((self.name, self.density_g_cm3, tuple(self.mass_fractions.items())))
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         return (Material, (self.name, self.density_g_cm3, dict(self.mass_fractions)))
 
-    def attenuation(self, energies_kev: Any, kind: str = "total") -> Floats:
+    def attenuation(self, energies_kev: ArrayLike, kind: str = "total") -> Floats:
         """Linear attenuation coefficient in mm⁻¹.
 
         Args:
@@ -186,7 +190,7 @@ class Material:
             total += fraction * _mass_attenuation(element, packed, kind)
         return (total * (self.density_g_cm3 / 10.0)).reshape(energies.shape)  # cm⁻¹ → mm⁻¹
 
-    def hu(self, energies_kev: Any, weights: Any = 1.0) -> float:
+    def hu(self, energies_kev: ArrayLike, weights: ArrayLike = 1.0) -> float:
         """Effective CT number against water for a spectrum: 1000 (Σ w μ / Σ w μ_water − 1).
 
         Args:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -68,7 +67,7 @@ class SinusoidalMotion:
         """Both ends of the displacement, ``(2, 3)`` mm."""
         return np.stack([-self.amplitude * self._unit, self.amplitude * self._unit])
 
-    def scaled(self, fraction: Any) -> SinusoidalMotion:
+    def scaled(self, fraction: ArrayLike) -> SinusoidalMotion:
         """The same motion with ``fraction`` times the amplitude (residual motion after gating)."""
         scaled = self.amplitude * number("fraction", fraction)
         return SinusoidalMotion(self.body, scaled, self.rate_bpm, self.phase, self.direction)

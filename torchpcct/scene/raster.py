@@ -7,7 +7,7 @@ Those of bodies serve as reference images and label maps, never to simulate a sc
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
@@ -21,6 +21,10 @@ from torchpcct.scene.chord_kernels import interval
 from torchpcct.scene.chords import pack
 from torchpcct.threads import run
 from torchpcct.validate import checked, whole
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Ints
+
 
 __all__ = ["label_fractions", "volume_fractions"]
 
@@ -250,7 +254,7 @@ def _cut(
         + across[None, :, 1:] * second[:, None]
     )  # (N, lines, 3): the middle of each line
 
-    def total(voxel: Any, label: Any) -> NDArray[np.int64]:
+    def total(voxel: Ints, label: Ints) -> NDArray[np.int64]:
         return np.bincount(voxel * (count + 1) + label + 1, minlength=n * (count + 1))
 
     ends = np.linspace(-0.5, 0.5, _SEGMENTS + 1)

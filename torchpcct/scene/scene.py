@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,7 +45,7 @@ class Body:
 
     name: str
     shape: Shape
-    material: Any
+    material: Material | str
     parent: str | None = None
 
     def __post_init__(self) -> None:
@@ -286,7 +285,7 @@ class Scene:
                         f"{_format(points[deepest])} mm: move one, or make it the other's child"
                     )
 
-    def replace_material(self, name: str, material: Any) -> Scene:
+    def replace_material(self, name: str, material: Material | str) -> Scene:
         """The same scene with another material in the body ``name``."""
         k = self.index(name)
         bodies = (
@@ -306,7 +305,7 @@ class Scene:
         scene."""
         return Scene((*self.bodies, *bodies), self.motion)
 
-    def labels(self, where: Any) -> NDArray[np.int64]:
+    def labels(self, where: VolumeGrid | ArrayLike) -> NDArray[np.int64]:
         """Index of the innermost body at points or voxel centres, −1 in the surroundings; at rest.
 
         Args:

@@ -16,7 +16,6 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -111,7 +110,7 @@ class VoxelScene:
         *,
         energies_kev: ArrayLike | None = None,
         weights: ArrayLike = 1.0,
-        dense: Any = "bone",
+        dense: object = "bone",
         tissues: Sequence[Material | str] | None = None,
     ) -> None:
         values = np.asarray(hu, dtype=np.float32)
@@ -146,7 +145,7 @@ class VoxelScene:
         self._lines = [np.array([self.tissues.index(t) for t in line]) for line in lines]
         self._read(70.0 if energies_kev is None else energies_kev, weights)
 
-    def _read(self, energies_kev: Any, weights: Any) -> None:
+    def _read(self, energies_kev: ArrayLike, weights: ArrayLike) -> None:
         self.numbers = np.array([t.hu(energies_kev, weights) for t in self.tissues])
         for line in self._lines:
             if (np.diff(self.numbers[line]) <= 0).any():
@@ -155,7 +154,7 @@ class VoxelScene:
                     f"tissues must be in the order of their CT numbers, got {listed} HU"
                 )
 
-    def read_by(self, energies_kev: Any, weights: Any) -> VoxelScene:
+    def read_by(self, energies_kev: ArrayLike, weights: ArrayLike) -> VoxelScene:
         """The same volume, its numbers read in a scanner's spectrum behind water as thick as the
         body.
 
@@ -204,13 +203,13 @@ class VoxelScene:
         which = np.zeros(1, np.int64) if self.labels is None else self.labels
         return {name: float((dense & (which == k)).mean()) for k, name in enumerate(self._dense)}
 
-    def contrast(self, energies: Any) -> Floats:
+    def contrast(self, energies: ArrayLike) -> Floats:
         """Attenuation of the tissues minus that of air, which fills the rest: ``(tissues, E)``
         mm⁻¹."""
         mu = np.stack([np.asarray(t.attenuation(energies), dtype=np.float64) for t in self.tissues])
         return mu - np.asarray(MATERIALS["air"].attenuation(energies), dtype=np.float64)
 
-    def mixed(self, values: Any) -> NDArray[np.float32]:
+    def mixed(self, values: ArrayLike) -> NDArray[np.float32]:
         """One number per tissue as a map: ``(tissues, components)`` to ``(components, z, y, x)``
         float32."""
         of_tissues = np.asarray(values, dtype=np.float64)
@@ -228,12 +227,12 @@ class VoxelScene:
             else np.zeros((0, *self.grid.shape), np.float32)
         )
 
-    def _of_voxels(self, per_line: list[Any]) -> Any:
+    def _of_voxels(self, per_line: list[Floats]) -> Floats:
         """For every voxel the value of its own line of tissues."""
         return per_line[0] if self.labels is None else np.choose(self.labels, per_line)
 
 
-def _labels(value: Any, grid: VolumeGrid) -> NDArray[np.int64]:
+def _labels(value: object, grid: VolumeGrid) -> NDArray[np.int64]:
     labels = np.asarray(value)
     if labels.dtype.kind not in "biuf":
         raise TypeError(

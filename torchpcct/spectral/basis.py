@@ -12,7 +12,6 @@ K edge at 33.2 keV, inside the spectrum, so blood with contrast agent is only ap
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -122,7 +121,7 @@ class Basis:
         return np.asarray(np.tensordot(self.attenuation(energies_kev).T, c, axes=1))
 
     def residual(
-        self, of: Material | str, energies_kev: ArrayLike = FIT_ENERGIES_KEV, **fit: Any
+        self, of: Material | str, energies_kev: ArrayLike = FIT_ENERGIES_KEV, **fit: ArrayLike
     ) -> Floats:
         """What the basis cannot express of a material, in HU at each energy: ``(E,)``, fit less
         exact.

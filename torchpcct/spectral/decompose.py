@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -22,6 +22,10 @@ from torchpcct.spectral.decompose_kernels import solve
 from torchpcct.spectral.model import SpectralModel, evaluate, one_bin
 from torchpcct.threads import run
 from torchpcct.validate import checked
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Floats, Ints
+
 
 __all__ = [
     "Decomposition",
@@ -91,8 +95,8 @@ def decompose(
     counts: Tensor,
     model: SpectralModel,
     *,
-    columns: Any = None,
-    scale: Any = None,
+    columns: object = None,
+    scale: object = None,
     bias_reduction: bool = True,
     tolerance: float = TOLERANCE,
 ) -> Decomposition:
@@ -180,7 +184,7 @@ def decompose(
     return Decomposition(line_integrals, information, at_bound, (steps > 0).reshape(shape))
 
 
-def _check_bins(counts: Any, model: SpectralModel, column: Any) -> None:
+def _check_bins(counts: Floats, model: SpectralModel, column: Ints) -> None:
     """Refuse, or name, rays ``(bins, rays)`` that cannot tell two materials apart."""
     silent = model.spectra.sum(-1) == 0.0  # (columns, bins)
     for b in np.flatnonzero(silent.any(0)):
@@ -209,8 +213,8 @@ def cramer_rao(
     line_integrals: Tensor,
     model: SpectralModel,
     *,
-    columns: Any = None,
-    scale: Any = None,
+    columns: object = None,
+    scale: object = None,
     order: int = 1,
 ) -> Tensor:
     """Smallest covariance of any unbiased estimate, at true line integrals.

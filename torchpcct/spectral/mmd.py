@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -29,6 +29,12 @@ from torch import Tensor
 from torchpcct.scene.materials import Material
 from torchpcct.spectral.basis import FIT_ENERGIES_KEV, Basis
 from torchpcct.validate import checked
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from torchpcct.typing import Floats
+
 
 __all__ = ["MMD_TISSUES", "clean", "label", "mmd", "nearest"]
 
@@ -45,7 +51,7 @@ _ITERATIONS = 50
 def mmd(
     basis_images: Tensor,
     basis: Basis,
-    tissues: Sequence[Material | str] | Any = MMD_TISSUES,
+    tissues: Sequence[Material | str] | ArrayLike = MMD_TISSUES,
     covariance: ArrayLike | None = None,
 ) -> Tensor:
     """Volume fractions.
@@ -101,7 +107,7 @@ def mmd(
     return fractions.reshape(count, *images.shape[1:]).to(images)
 
 
-def _corners(basis: Basis, tissues: Any) -> Any:
+def _corners(basis: Basis, tissues: Any) -> Floats:
     if isinstance(tissues, np.ndarray | Tensor):
         c = torch.as_tensor(tissues).detach().to("cpu", torch.float64).numpy()
     else:
@@ -118,7 +124,7 @@ def _corners(basis: Basis, tissues: Any) -> Any:
     return c
 
 
-def _whitening(basis: Basis, covariance: Any) -> Any:
+def _whitening(basis: Basis, covariance: ArrayLike | None) -> NDArray[np.floating]:
     """2 × 2 matrix after which distances are Euclidean."""
     if covariance is None:
         mu = basis.attenuation(FIT_ENERGIES_KEV)
@@ -132,7 +138,7 @@ def _whitening(basis: Basis, covariance: Any) -> Any:
     return np.linalg.cholesky(np.linalg.inv(np.array([[c[0], c[1]], [c[1], c[2]]]))).T
 
 
-def _area(corners: Any) -> float:
+def _area(corners: Floats) -> float:
     a, b = (corners[:, 1:] - corners[:, :1]).T
     return float(abs(a[0] * b[1] - a[1] * b[0]))
 
@@ -173,7 +179,7 @@ def label(fractions: Tensor) -> Tensor:
 def nearest(
     fractions: Tensor,
     basis: Basis,
-    tissues: Sequence[Material | str] | Any = MMD_TISSUES,
+    tissues: Sequence[Material | str] | ArrayLike = MMD_TISSUES,
     covariance: ArrayLike | None = None,
 ) -> Tensor:
     """The pure tissue nearest to each mixture: k-means whose centres stay at the tissues, which are

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -25,6 +25,12 @@ from torchpcct.spectral.basis import Basis, pe_pvc
 from torchpcct.spectral.decompose_kernels import expected
 from torchpcct.threads import run
 from torchpcct.validate import reals, shaped
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from torchpcct.typing import Ints
+
 
 __all__ = ["SpectralModel"]
 
@@ -249,8 +255,11 @@ class SpectralModel:
         ]
 
     def rays(
-        self, shape: tuple[int, ...], columns: Any = None, scale: Any = None
-    ) -> tuple[Any, Any]:
+        self,
+        shape: tuple[int, ...],
+        columns: Any = None,
+        scale: Any = None,
+    ) -> tuple[Ints, Floats]:
         """Column indices (int64) and intensities (float64) of rays of a shape, flat arrays.
 
         Args:
@@ -287,7 +296,13 @@ class SpectralModel:
         intensity = np.array(np.broadcast_to(factor, shape), np.float64, order="C").reshape(-1)
         return column, intensity
 
-    def expected(self, line_integrals: Tensor, *, columns: Any = None, scale: Any = None) -> Tensor:
+    def expected(
+        self,
+        line_integrals: Tensor,
+        *,
+        columns: ArrayLike | None = None,
+        scale: ArrayLike | None = None,
+    ) -> Tensor:
         """Expected counts.
 
         Args:
@@ -310,7 +325,7 @@ class SpectralModel:
 
 
 def evaluate(
-    model: SpectralModel, line_integrals: Tensor, column: Any, intensity: Any
+    model: SpectralModel, line_integrals: Tensor, column: Ints, intensity: Floats
 ) -> tuple[Floats, Floats]:
     """Expected counts ``(bins, rays)`` and their derivatives, float64.
 

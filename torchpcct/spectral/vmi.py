@@ -11,7 +11,6 @@ the basis values, so its noise follows from their 2 × 2 covariance.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -53,7 +52,7 @@ def vmi_weights(basis: Basis, energies_kev: ArrayLike = VMI_ENERGIES_KEV) -> tup
     return 1000.0 * basis.attenuation(energies).T / span[:, None], -1000.0 * mu_water / span
 
 
-def _pair(name: str, value: Any, entries: int) -> Tensor:
+def _pair(name: str, value: object, entries: int) -> Tensor:
     t = torch.as_tensor(value)
     if t.ndim < 1 or t.shape[0] != entries:
         raise ValueError(

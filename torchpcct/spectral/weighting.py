@@ -72,12 +72,12 @@ class BinWeights(np.ndarray[Any, np.dtype[np.float64]]):
         self.scanner, self.contrast, self.behind = scanner, tuple(contrast), dict(behind or {})
         return self
 
-    def __array_finalize__(self, source: Any) -> None:
+    def __array_finalize__(self, source: object) -> None:
         self.scanner = getattr(source, "scanner", None)
         self.contrast = getattr(source, "contrast", ())
         self.behind = getattr(source, "behind", {})
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> tuple[object, ...]:
         return BinWeights, (np.asarray(self), self.scanner, self.contrast, self.behind)
 
 
@@ -115,7 +115,7 @@ def weighting_gain(
     scanner: Scanner,
     contrast: Sequence[Material | str],
     behind: Mapping[Any, float] | None = None,
-    weights: Any = "bins",
+    weights: object = "bins",
 ) -> Floats:
     """What weights bring: squared signal-to-noise ratio of a small contrast over that of the summed
     counts, which is the factor in dose.
@@ -151,7 +151,7 @@ def contrast_information(
     scanner: Scanner,
     contrast: Sequence[Material | str],
     behind: Mapping[Any, float] | None = None,
-    weights: Any = "bins",
+    weights: object = "bins",
 ) -> Floats:
     """Squared signal-to-noise ratio of a small contrast that is larger than a cell, per mm² of its
     thickness and mAs: what detectors with other thresholds, resolution or charge sharing are
@@ -195,7 +195,9 @@ def contrast_information(
 
 
 def _photons(
-    scanner: Scanner, contrast: Any, behind: Any
+    scanner: Scanner,
+    contrast: Sequence[Material | str],
+    behind: Mapping[Any, float] | None,
 ) -> tuple[Floats, Floats, tuple[str, ...], dict[str, float]]:
     """Photons ``(bins, columns, E)`` that are counted behind the materials, the contrast ``(E,)``
     in mm⁻¹, and the names."""
@@ -258,7 +260,7 @@ def _bin_text(scanner: Scanner, index: int) -> str:
     return f"counted from 0; {thresholds[index]:g}{upper} keV"
 
 
-def _values(weights: Any, shape: tuple[int, ...]) -> Floats:
+def _values(weights: object, shape: tuple[int, ...]) -> Floats:
     values = np.asarray(reals("weights", weights), np.float64)
     if values.shape != shape:
         raise ValueError(

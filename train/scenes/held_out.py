@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,6 +15,10 @@ from torchpcct.validate import number
 from train.scenes.drawing import STEP, Draw, curve, vessel_table
 from train.scenes.rasterise import rasterise
 from train.scenes.scene import Solid, Tissue, TrainingScene, Triple, Vessel
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
 
 __all__ = ["HeldOutPlaques", "held_out_plaques"]
 
@@ -87,7 +91,7 @@ def held_out_plaques(
     return HeldOutPlaques(image, core, inside, around, tuple(scenes))
 
 
-def _checked(shape: Any) -> tuple[int, int, int]:
+def _checked(shape: Sequence[int]) -> tuple[int, int, int]:
     """Shape of a grid; ``ValueError`` unless it is three positive numbers."""
     if len(shape) != 3 or any(int(n) != n or n < 1 for n in shape):
         raise ValueError(

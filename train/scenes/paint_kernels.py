@@ -14,7 +14,7 @@ the plane normal to the curve there.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeAlias
 
 import numba
 import numpy as np
@@ -23,6 +23,9 @@ from train.scenes.scene import Tissue
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from torchpcct.typing import Floats, Ints
+
 
 OUTER, INNER, LUMEN, QUADRIC, QUADRIC_IN_TUBE, STENT, HALO = range(7)
 """What a body is: the wall's outside, its inside, the lumen; a superquadric, one in a tube's
@@ -33,6 +36,10 @@ TISSUES = len(Tissue)
 """Number of tissues."""
 BACKGROUND = int(Tissue.BACKGROUND)
 """Number of what no body covers."""
+
+
+Painting: TypeAlias = "tuple[Floats, Floats, Floats, Ints, Floats, Floats, float]"
+"""Tables, tubes, reaches, bodies, values and rows of a scene, and its background."""
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -327,7 +334,7 @@ def _fill(
 
 
 def paint(
-    shape: tuple[int, int, int], cell: float, arrays: tuple[Any, ...], signal: int, around: int
+    shape: tuple[int, int, int], cell: float, arrays: Painting, signal: int, around: int
 ) -> NDArray[np.float32]:
     """Averages over cubic cells of a grid about the origin, ``(5, nz, ny, nx)`` float32.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,12 @@ from train.scenes.paint_kernels import (
     paint,
 )
 from train.scenes.scene import COLUMNS, Solid, Tissue, TrainingScene
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from train.scenes.paint_kernels import Painting
+
 
 CELLS = 2
 """Cells along each edge of a voxel: at voxels of 0.2 mm, averages are within a HU rms of
@@ -83,7 +89,7 @@ def _mask(tissues: tuple[Tissue, ...]) -> int:
     return sum(1 << int(t) for t in tissues)
 
 
-def _arrays(scene: TrainingScene, cell: float) -> tuple[Any, ...]:
+def _arrays(scene: TrainingScene, cell: float) -> Painting:
     """What :func:`train.scenes.paint_kernels.paint` reads of a scene, in the order of painting."""
     bodies: list[tuple[int, int, int, int]] = []
     values: list[float] = []
@@ -95,7 +101,7 @@ def _arrays(scene: TrainingScene, cell: float) -> tuple[Any, ...]:
         tissue: Tissue,
         displaces: tuple[Tissue, ...],
         hu: float,
-        row: Any = (),
+        row: Sequence[float] = (),
     ) -> None:
         bodies.append((kind, vessel, int(tissue), _mask(displaces)))
         values.append(hu)

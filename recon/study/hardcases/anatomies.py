@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -65,7 +64,7 @@ def anatomy_rows(
     reconstruct: Reconstruct,
     kind: Callable[[str], str],
     pieces: Pieces,
-) -> list[dict[str, Any]]:
+) -> list[dict[str, object]]:
     """A row for each method, without noise and as the mean over draws of it: ``anatomy``,
     ``title``, ``method``, ``draws`` (0: without noise), ``recovered`` (None if refused), ``soft``,
     ``messages``, ``verdict``.
@@ -93,7 +92,9 @@ def anatomy_rows(
         realisations.append((draws, drawn))
     for number, pairs in realisations:
 
-        def shown(method: str, pairs: Any = pairs) -> tuple[float | None, list[str]]:
+        def shown(
+            method: str, pairs: Sequence[tuple[Scan, Scan]] = pairs
+        ) -> tuple[float | None, list[str]]:
             return _recovered(pairs, grid, method, truth, reconstruct, kind)
 
         soft, refusal = pieces(f"{name}_{number}_soft", partial(shown, "soft"))

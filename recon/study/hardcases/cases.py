@@ -17,7 +17,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -35,6 +35,13 @@ from torchpcct.scene.materials import material
 from torchpcct.scene.phantoms import thorax
 from torchpcct.scene.plaque import Plaque, plaque_scene
 from torchpcct.scene.plaque.variants import calcification_bodies, stent_bodies
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from torchpcct.scene.bodies import Shape
+    from torchpcct.typing import Reals
+
 
 KEV = 70.0
 """Energy of the body's scan and of the cone beam's, keV."""
@@ -140,7 +147,7 @@ def _read(change: Change) -> Apply:
     )
 
 
-def _views(title: str, keep: Callable[[int], NDArray[Any]]) -> Case:
+def _views(title: str, keep: Callable[[int], NDArray[np.integer]]) -> Case:
     """Only some of the views."""
 
     def apply(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
@@ -175,7 +182,7 @@ def _dosed(title: str, factor: float, noise: float, tissues: bool = False) -> Ca
 
 
 def _lost(share: float) -> Case:
-    def change(n: Any, air: Any, rng: np.random.Generator) -> Any:
+    def change(n: Tensor, air: Tensor, rng: np.random.Generator) -> Tensor:
         return n.masked_fill(
             torch.from_numpy(rng.random(tuple(n.shape), dtype=np.float32) < share), 0.0
         )
@@ -223,7 +230,7 @@ def _jitter(share: float) -> Apply:
 def _per_view(amplitude: float, drift: bool) -> Apply:
     """A gain that drifts over the scan, or changes at random from view to view."""
 
-    def change(n: Any, air: Any, rng: np.random.Generator) -> Any:
+    def change(n: Tensor, air: Tensor, rng: np.random.Generator) -> Tensor:
         views = len(n)
         part = (
             torch.linspace(0, 1, views)
@@ -475,7 +482,7 @@ def _implants(_: Plaque) -> Scene:
 
 
 def _zeros(views: slice, columns: slice) -> Apply:
-    def change(n: Any, air: Any, rng: np.random.Generator) -> Any:
+    def change(n: Tensor, air: Tensor, rng: np.random.Generator) -> Tensor:
         n = n.clone()
         n[views, columns] = 0.0
         return n
@@ -483,7 +490,7 @@ def _zeros(views: slice, columns: slice) -> Apply:
     return _read(change)
 
 
-def _given(title: str, change: Callable[[Any], Any], air: float | None = PHOTONS) -> Case:
+def _given(title: str, change: Callable[[Reals], Reals], air: float | None = PHOTONS) -> Case:
     """What a user makes of an array of readings: counts with these in air; None: line integrals."""
 
     def apply(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
@@ -495,15 +502,15 @@ def _given(title: str, change: Callable[[Any], Any], air: float | None = PHOTONS
     return Case(title, apply)
 
 
-def _lines(n: Any) -> Any:
+def _lines(n: Reals) -> Reals:
     return np.log(PHOTONS / (n + 1.0))
 
 
-def _spoilt(value: float) -> Callable[[Any], Any]:
+def _spoilt(value: float) -> Callable[[Reals], Reals]:
     return lambda n: np.where(np.random.default_rng(0).random(n.shape) < 0.01, np.float32(value), n)
 
 
-def _turned(scan: Scan, angles: Any, counts: Tensor | None = None) -> Scan:
+def _turned(scan: Scan, angles: ArrayLike, counts: Tensor | None = None) -> Scan:
     return replace(
         scan,
         counts=scan.counts if counts is None else counts,
@@ -807,7 +814,7 @@ def cone_truth(scene: Scene) -> Tensor:
 
 def _displaced(scene: Scene, by: tuple[float, float, float]) -> Scene:
     def there(body: Body) -> Body:
-        shape: Any = body.shape
+        shape: Shape = body.shape
         return replace(body, shape=replace(shape, position=tuple(np.add(shape.position, by))))
 
     return Scene([there(body) for body in scene.bodies])
@@ -829,7 +836,7 @@ def _tilted(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
     tilt = rotation_matrix((1.0, 0.0, 0.0), math.radians(-12.0))
 
     def there(body: Body) -> Body:
-        shape: Any = body.shape
+        shape: Shape = body.shape
         return replace(
             body,
             shape=replace(

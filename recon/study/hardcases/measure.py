@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -48,6 +48,10 @@ from torchpcct.scene.phantoms import thorax
 from torchpcct.scene.plaque import Plaque, plaque_scene
 from torchpcct.validate import choice, number
 from torchpcct.volume import Volume
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 RIGHT_NOISES = 0.5
 """A result is right if what the case adds is at most half of the noise that the sound scan has
@@ -310,7 +314,7 @@ def _sound(settings: HardcasesSettings, pieces: Pieces, name: str, method: str) 
 
 def _case(
     settings: HardcasesSettings, pieces: Pieces, name: str, base: _Base | None = None
-) -> list[dict[str, Any]]:
+) -> list[dict[str, object]]:
     """A row for each method; without ``base``, its sound scan, this is computed or read first."""
     base = base or _BASES[CASES[name].base](settings, pieces.within(CASES[name].base), silent)
     pieces = pieces.within(f"case_{name}")
@@ -349,7 +353,7 @@ def _case(
 
 def _anatomy(
     settings: HardcasesSettings, pieces: Pieces, name: str, base: _Base | None = None
-) -> list[dict[str, Any]]:
+) -> list[dict[str, object]]:
     """See :func:`recon.study.hardcases.anatomies.anatomy_rows`."""
     base = base or _BASES["plaque"](settings, pieces.within("plaque"), silent)
     return anatomy_rows(
@@ -401,7 +405,7 @@ def _row(
     seen: torch.Tensor,
     lost: float,
     soft: float | None,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """A case by a method; ``seen``: the voxels that count, ``lost``: ``noise`` of
     :func:`verdict`."""
     sound, usual, noise = base.sound(method)
@@ -439,7 +443,7 @@ def _rms(difference: torch.Tensor) -> float:
     return float(difference.double().square().mean().sqrt())
 
 
-def figures(measured: Measured) -> dict[str, Any]:
+def figures(measured: Measured) -> dict[str, Figure]:
     """Error over noise of every case, a panel per method; refused cases have no bar."""
     from matplotlib.figure import Figure
 

@@ -79,7 +79,7 @@ SPECTRAL = {
 predictions move by 48–56 keV with the assumed filtration), and the noise levels up to which tissue
 maps show the core and at which they do not."""
 
-BOWTIE: dict[str, Any] = {
+BOWTIE: dict[str, float] = {
     "skin_reduction_percent": 55.0,
     "total_dose_factor": 8.0,
 }

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,12 @@ from torchpcct.scan import Scan
 from torchpcct.scanner import Scanner, presets
 from torchpcct.scene import Body, EllipticCylinder, Scene
 from torchpcct.scene.plaque import Plaque
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from torchpcct.metrics.roi import RoiMean
+
 
 INSET_MM = (11.3, 9.0, 9.0)
 """Extent (z, y, x) of the reconstructed inset: the paper's 113 × 90 × 90 voxels of 0.1 mm."""
@@ -80,7 +86,7 @@ class PlaqueScan:
     clean: Scan
     fine: VolumeGrid
     grids: list[VolumeGrid]
-    pairs: list[Any]
+    pairs: list[tuple[RoiMean, RoiMean]]
     rois: RoiPair
     fbp: InsetFbp
 
@@ -126,7 +132,7 @@ def prepare(
     )
 
 
-def reference_fbp(scan: Scan, grid: VolumeGrid, motion: Any = None) -> Tensor:
+def reference_fbp(scan: Scan, grid: VolumeGrid, motion: ArrayLike | None = None) -> Tensor:
     """FBP with the reference kernel, ``(z, y, x)`` HU; ``motion``: of
     :class:`recon.analytic.inset.InsetFbp`."""
     return InsetFbp(scan, [grid], [REFERENCE_KERNEL], motion=motion)(scan)[0][0]

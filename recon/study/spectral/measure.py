@@ -22,7 +22,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -48,6 +48,14 @@ from torchpcct.spectral import (
 )
 from torchpcct.validate import number
 from torchpcct.viz import WINDOW_HU
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
+
+    from torchpcct.typing import Reals
+
 
 VISIBLE_DICE = 0.5
 """The core counts as visible in a tissue map if its Dice coefficient reaches this. The paper
@@ -203,18 +211,18 @@ def measure(
 
 def _noisy(
     s: SpectralSettings, pieces: Pieces, k: int, scan: SpectralScan | None = None
-) -> tuple[Tensor, list[Tensor], dict[str, Any]]:
+) -> tuple[Tensor, list[Tensor], dict[str, object]]:
     """FBP of a realisation, its line integrals if MBIR needs them, and what is told of its rays."""
     scan = scan or SpectralScan(s, pieces=pieces)
 
-    def draw() -> tuple[Tensor, list[Tensor], dict[str, Any]]:
+    def draw() -> tuple[Tensor, list[Tensor], dict[str, object]]:
         noisy, statistics = scan.noisy(s.exposure_s, s.seed + k)
         return scan.fbp.images(noisy)[0][0], [noisy] if k < s.mbir_realizations else [], statistics
 
     return pieces(f"noisy_{k}", draw)
 
 
-def _curve(curve: VmiCurve) -> dict[str, Any]:
+def _curve(curve: VmiCurve) -> dict[str, object]:
     return {
         "contrast_hu": curve.contrast.tolist(),
         "noise_hu": curve.noise.tolist(),
@@ -253,7 +261,7 @@ def _vmi(scan: SpectralScan, images: Images) -> dict[str, Any]:
 
 def _scores(
     level: float, tissues: Tissues, volumes: Sequence[Tensor] | Tensor, rule: str = "nearest"
-) -> Any:
+) -> dict[str, object]:
     """Mean and SD of every tissue's Dice coefficient over realisations."""
     values = np.array([tissues.dice(v, rule) for v in volumes])
     spread = values.std(0, ddof=1) if len(values) > 1 else np.full(len(MMD_TISSUES), np.nan)
@@ -380,12 +388,14 @@ def checks(data: dict[str, Any]) -> list[Check]:
     ]
 
 
-def figures(measured: Measured) -> dict[str, Any]:
+def figures(measured: Measured) -> dict[str, Figure]:
     """Basis and monochromatic images with the CNR curve, and tissue maps."""
     return {"spectral.png": _curves_figure(measured), "tissues.png": _tissue_figure(measured)}
 
 
-def _show(ax: Any, image: Any, measured: Measured, title: str, **options: Any) -> Any:
+def _show(
+    ax: Axes, image: Reals | Tensor, measured: Measured, title: str, **options: Any
+) -> AxesImage:
     ax.set_xticks([])
     ax.set_yticks([])
     ax.set_title(title, fontsize=8)
@@ -395,7 +405,7 @@ def _show(ax: Any, image: Any, measured: Measured, title: str, **options: Any) -
     )
 
 
-def _curves_figure(measured: Measured) -> Any:
+def _curves_figure(measured: Measured) -> Figure:
     """Basis images, monochromatic images (noise free above, standard noise below), and CNR
     against energy."""
     from matplotlib.figure import Figure
@@ -468,7 +478,7 @@ def _curves_figure(measured: Measured) -> Any:
     return figure
 
 
-def _tissue_figure(measured: Measured) -> Any:
+def _tissue_figure(measured: Measured) -> Figure:
     """Tissue maps of the middle slice: truth, then one column per noise level; rows: FBP, joint
     MBIR."""
     from matplotlib.colors import ListedColormap

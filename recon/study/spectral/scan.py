@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import cached_property, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -38,6 +38,13 @@ from torchpcct.spectral import (
 )
 from torchpcct.threads import get_num_threads
 from torchpcct.validate import choice
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from torchpcct.detector_window import DetectorWindow
+    from torchpcct.scan import Scan
+
 
 FAT_MM = 3.2
 """From the vessel's axis on there is only fat."""
@@ -102,7 +109,7 @@ class SpectralScan:
         on = 1.0 if full_views is None else duty(self.scanner, full_views)
         self.grid = inset_grid(self.plaque, settings.voxel_mm)
 
-        def run() -> Any:
+        def run() -> tuple[Scan, DetectorWindow]:
             scan = acquire(self.scene, self.scanner, region=self.grid, duty=on, progress=progress)
             assert scan.window is not None
             window = footprint(scan.geometry, self.grid).widened(NOISE_COLUMNS, scan.window)
@@ -147,7 +154,9 @@ class SpectralScan:
         """Cramér–Rao covariance ``(3, views, rows, columns)`` in mm² of every ray."""
         return self.exact.covariance * (NOISE_FREE_EXPOSURE_S / exposure_s)
 
-    def noisy(self, exposure_s: float, seed: int, step: int = 1) -> tuple[Tensor, dict[str, Any]]:
+    def noisy(
+        self, exposure_s: float, seed: int, step: int = 1
+    ) -> tuple[Tensor, dict[str, object]]:
         """A noisy scan, only every ``step``-th view of it, decomposed.
 
         Returns:
@@ -219,7 +228,7 @@ class Tissues:
         corners: ``(2, tissues)`` coefficients of the tissues.
     """
 
-    def __init__(self, scan: SpectralScan, covariance: Any) -> None:
+    def __init__(self, scan: SpectralScan, covariance: ArrayLike) -> None:
         self.basis, self.covariance = scan.basis, np.asarray(covariance, np.float64)
         z = scan.grid.axes[0]
         core = scan.scene["core"].shape.bounding_box

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -92,7 +90,7 @@ class ConePasses:
         return int(max(1, min(self.tables.rays.views, ROW_SUMS_BYTES // self.bytes(itemsize)[2])))
 
 
-def running_sums(x: NDArray[Any]) -> NDArray[Any]:
+def running_sums(x: NDArray[np.float32 | np.float64]) -> NDArray[np.float32 | np.float64]:
     """``(nz, ny, nx)`` to the ``lines`` of ``cone_kernels.project``."""
     nz, ny, nx = x.shape
     lines = np.empty((ny * nx, padded(nz) + 8), dtype=x.dtype)

@@ -15,11 +15,18 @@ that numba compiles one version of each and caches it.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING
 
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numba.core.cpu import CPUContext
+    from numba.core.typing import Signature
+
 
 _FUSED = ("contract", "nsz", "arcp", "reassoc")
 
@@ -28,7 +35,13 @@ class _Code:
     """Helpers to write the loops; ``real``: the scalar type, ``wide``: all lanes, ``double``:
     those of two knots."""
 
-    def __init__(self, context: Any, builder: Any, signature: Any, args: Any) -> None:
+    def __init__(
+        self,
+        context: CPUContext,
+        builder: ir.IRBuilder,
+        signature: Signature,
+        args: Sequence[ir.Value],
+    ) -> None:
         self.b, self.context = builder, context
         self.width = signature.args[0].count
         self.dtype = next(t for t in signature.args if isinstance(t, types.Array)).dtype
@@ -41,52 +54,54 @@ class _Code:
             for t, a in zip(signature.args, args, strict=True)
         ]
 
-    def at(self, pointer: Any, index: Any, kind: Any) -> Any:
+    def at(self, pointer: ir.Value, index: ir.Value, kind: ir.Type) -> ir.Value:
         typed = self.b.bitcast(pointer, self.real.as_pointer())
         return self.b.bitcast(self.b.gep(typed, [index]), kind.as_pointer())
 
-    def load(self, pointer: Any, index: Any, kind: Any) -> Any:
+    def load(self, pointer: ir.Value, index: ir.Value, kind: ir.Type) -> ir.Value:
         return self.b.load(self.at(pointer, index, kind), align=self.dtype.bitwidth // 8)
 
-    def store(self, value: Any, pointer: Any, index: Any) -> None:
+    def store(self, value: ir.Value, pointer: ir.Value, index: ir.Value) -> None:
         self.b.store(value, self.at(pointer, index, value.type), align=self.dtype.bitwidth // 8)
 
-    def mul(self, a: Any, b: Any) -> Any:
+    def mul(self, a: ir.Value, b: ir.Value) -> ir.Value:
         return self.b.fmul(a, b, flags=_FUSED)
 
-    def add(self, a: Any, b: Any) -> Any:
+    def add(self, a: ir.Value, b: ir.Value) -> ir.Value:
         return self.b.fadd(a, b, flags=_FUSED)
 
-    def sub(self, a: Any, b: Any) -> Any:
+    def sub(self, a: ir.Value, b: ir.Value) -> ir.Value:
         return self.b.fsub(a, b, flags=_FUSED)
 
-    def fused(self, a: Any, b: Any, c: Any) -> Any:
+    def fused(self, a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:
         """``a * b + c``, rounded once where the machine can: the same in every kernel and width."""
         count = "" if not isinstance(a.type, ir.VectorType) else f"v{a.type.count}"
         name = f"llvm.fmuladd.{count}f{self.dtype.bitwidth}"
         kind = ir.FunctionType(a.type, [a.type] * 3)
         return self.b.call(cgutils.get_or_insert_function(self.b.module, kind, name), [a, b, c])
 
-    def splat(self, value: Any, count: int) -> Any:
+    def splat(self, value: ir.Value, count: int) -> ir.Value:
         """A scalar in all places of a vector."""
         undefined = ir.Constant(ir.VectorType(value.type, count), ir.Undefined)
         one = self.b.insert_element(undefined, value, ir.Constant(ir.IntType(32), 0))
         return self.shuffle(one, undefined, [0] * count)
 
-    def shuffle(self, a: Any, b: Any, places: list[int]) -> Any:
+    def shuffle(self, a: ir.Value, b: ir.Value, places: list[int]) -> ir.Value:
         return self.b.shuffle_vector(
             a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(places)), places)
         )
 
-    def clamp(self, value: Any, top: Any) -> Any:
+    def clamp(self, value: ir.Value, top: ir.Value) -> ir.Value:
         zero = ir.Constant(value.type, None)
         value = self.b.select(self.b.fcmp_ordered(">", value, zero), value, zero)
         return self.b.select(self.b.fcmp_ordered("<", value, top), value, top)
 
-    def times(self, index: Any, factor: int) -> Any:
+    def times(self, index: ir.Value, factor: int) -> ir.Value:
         return self.b.mul(index, ir.Constant(self.index, factor), flags=("nsw", "nuw"))
 
-    def _places(self, p: Any, q: Any, first: Any, count: int, top: Any) -> tuple[Any, Any]:
+    def _places(
+        self, p: ir.Value, q: ir.Value, first: ir.Value, count: int, top: ir.Value
+    ) -> tuple[ir.Value, ir.Value]:
         """Lower knots of ``t = p + q r`` and what ``t`` exceeds them by, for the slabs ``first …
         + count``."""
         reals, integers = (ir.VectorType(self.real, count), ir.VectorType(ir.IntType(32), count))
@@ -99,12 +114,12 @@ class _Code:
         k = self.b.fptosi(t, integers)
         return k, self.sub(t, self.b.sitofp(k, reals))
 
-    def _index(self, k: Any, i: int) -> Any:
+    def _index(self, k: ir.Value, i: int) -> ir.Value:
         return self.b.zext(self.b.extract_element(k, ir.Constant(ir.IntType(32), i)), self.index)
 
     def knots(
-        self, p: Any, q: Any, first: Any, count: int, weight: Any, top: Any
-    ) -> list[tuple[Any, Any]]:
+        self, p: ir.Value, q: ir.Value, first: ir.Value, count: int, weight: ir.Value, top: ir.Value
+    ) -> list[tuple[ir.Value, ir.Value]]:
         """Lower knot of ``t = p + q r`` and the weights of its lanes and the next knot's, slabs
         ``first … + count``.
 
@@ -124,8 +139,15 @@ class _Code:
         ]
 
     def knots_apart(
-        self, p: Any, q: Any, first: Any, count: int, top: Any, ahead: Any, reach: int
-    ) -> list[tuple[Any, list[Any]]]:
+        self,
+        p: ir.Value,
+        q: ir.Value,
+        first: ir.Value,
+        count: int,
+        top: ir.Value,
+        ahead: ir.Value,
+        reach: int,
+    ) -> list[tuple[ir.Value, list[ir.Value]]]:
         """First shared knot and the lanes' weights of the ``reach + 1`` knots from there, for each
         slab.
 
@@ -156,13 +178,13 @@ class _Code:
             result.append((self._index(k, i), weights))
         return result
 
-    def ahead(self, apart: Any, q: Any) -> Any:
+    def ahead(self, apart: ir.Value, q: ir.Value) -> ir.Value:
         """Positions of the lanes beyond the shared one: ``q * apart[0] + apart[1]``."""
         across = self.load(apart, ir.Constant(self.index, 0), self.wide)
         along = self.load(apart, ir.Constant(self.index, self.width), self.wide)
         return self.add(self.mul(self.splat(q, self.width), across), along)
 
-    def slabs(self, r0: Any, r1: Any, body: Any) -> None:
+    def slabs(self, r0: ir.Value, r1: ir.Value, body: Callable[[ir.Value, int], None]) -> None:
         """Call ``body(first slab, how many)`` for groups of slabs, then for the rest one by one.
 
         Eight slabs at once fill the registers of few lanes; with many lanes they would spill.
@@ -176,11 +198,15 @@ class _Code:
             body(loop.index, 1)
 
 
-def _written(write: Any, *kinds: Any) -> Any:
+def _written(
+    write: Callable[..., None], *kinds: types.Type
+) -> tuple[Signature, Callable[..., ir.Value]]:
     """Signature and code of an intrinsic without result: ``write(code, *values)`` writes its
     loops."""
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def codegen(
+        context: CPUContext, builder: ir.IRBuilder, signature: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         code = _Code(context, builder, signature, args)
         write(code, *code.values)
         return context.get_dummy_value()
@@ -328,7 +354,7 @@ def add_edges(
     return signature, codegen
 
 
-def _columns(c: Any, size: Any, body: Any) -> None:
+def _columns(c: _Code, size: ir.Value, body: Callable[[ir.Value, int], None]) -> None:
     """Call ``body(first, vectors)`` for stretches of four vectors of W lanes along z, then of
     one."""
     long = 4 * c.width
@@ -367,14 +393,14 @@ def sum_lines(typingctx, lanes, lines, offset, low, e0, e1, size, total):
 
 
 def _gather_lines(
-    c: Any,
-    lines: Any,
-    offset: Any,
-    weights: Any,
-    e0: Any,
-    e1: Any,
-    size: Any,
-    targets: Any,
+    c: _Code,
+    lines: ir.Value,
+    offset: ir.Value,
+    weights: Sequence[ir.Value],
+    e0: ir.Value,
+    e1: ir.Value,
+    size: ir.Value,
+    targets: Sequence[ir.Value],
     fresh: bool,
 ) -> None:
     """Weighted sums of lines, one per target; ``fresh``: what the targets held before is
@@ -382,7 +408,7 @@ def _gather_lines(
     b = c.b
     sums = [[cgutils.alloca_once(b, c.wide) for _ in range(4)] for _ in targets]
 
-    def body(first: Any, vectors: int) -> None:
+    def body(first: ir.Value, vectors: int) -> None:
         places = [b.add(first, ir.Constant(c.index, i * c.width)) for i in range(vectors)]
         for target, total in zip(targets, sums, strict=True):
             for place, part in zip(places, total, strict=False):
@@ -423,12 +449,19 @@ def spread_line(typingctx, lanes, lines, offset, low, e0, e1, size, line):
 
 
 def _spread(
-    c: Any, lines: Any, offset: Any, weights: Any, e0: Any, e1: Any, size: Any, sources: Any
+    c: _Code,
+    lines: ir.Value,
+    offset: ir.Value,
+    weights: Sequence[ir.Value],
+    e0: ir.Value,
+    e1: ir.Value,
+    size: ir.Value,
+    sources: Sequence[ir.Value],
 ) -> None:
     """Add weighted sums of the sources to lines."""
     b = c.b
 
-    def body(first: Any, vectors: int) -> None:
+    def body(first: ir.Value, vectors: int) -> None:
         places = [b.add(first, ir.Constant(c.index, i * c.width)) for i in range(vectors)]
         given = [[c.load(source, place, c.wide) for place in places] for source in sources]
         with cgutils.for_range(b, e1, start=e0) as entry:

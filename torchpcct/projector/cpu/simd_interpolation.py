@@ -11,13 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from typing import Any
+from typing import TYPE_CHECKING
 
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from torchpcct.projector.cpu.simd import _written
+
+if TYPE_CHECKING:
+    from torchpcct.projector.cpu.simd import _Code
+
 
 # Eight positions at most this far apart fall on 8, or on 16, neighbouring knots.
 _STEP_OF_8 = 0.999
@@ -73,7 +77,15 @@ def add_between(typingctx, lanes, near, far, index, row, size, count, total):
     return _written(write, lanes, near, far, index, row, size, count, total)
 
 
-def _add_one(c: Any, near: Any, far: Any, index: Any, row: Any, i: Any, total: Any) -> None:
+def _add_one(
+    c: _Code,
+    near: ir.Value,
+    far: ir.Value,
+    index: ir.Value,
+    row: ir.Value,
+    i: ir.Value,
+    total: ir.Value,
+) -> None:
     """``add_between`` at one place."""
     k = c.b.zext(c.b.load(c.b.gep(index, [i])), c.index)
     value = c.load(total, c.times(i, c.width), c.wide)
@@ -84,8 +96,15 @@ def _add_one(c: Any, near: Any, far: Any, index: Any, row: Any, i: Any, total: A
 
 
 def _add_eights(
-    one: Any, near: Any, far: Any, index: Any, row: Any, size: Any, count: Any, total: Any
-) -> Any:
+    one: _Code,
+    near: ir.Value,
+    far: ir.Value,
+    index: ir.Value,
+    row: ir.Value,
+    size: ir.Value,
+    count: ir.Value,
+    total: ir.Value,
+) -> ir.Value:
     """``add_between`` at all whole eights of places with one lane; returns the first place left."""
     c = copy(one)
     c.width, c.wide = 8, ir.VectorType(c.real, 8)
@@ -118,7 +137,7 @@ def _add_eights(
     return c.times(eights, 8)
 
 
-def _picks(c: Any) -> bool:
+def _picks(c: _Code) -> bool:
     """Whether knots can be picked in registers."""
     features = c.context.codegen().magic_tuple()[2].split(",")
     return c.dtype == types.float32 and "+avx2" in features
@@ -128,12 +147,19 @@ class _Steps:
     """What a line rises by from each of evenly spaced positions to the next."""
 
     def __init__(
-        self, c: Any, line: Any, zeta0: Any, step: Any, last: Any, size: Any, count: Any
+        self,
+        c: _Code,
+        line: ir.Value,
+        zeta0: ir.Value,
+        step: ir.Value,
+        last: ir.Value,
+        size: ir.Value,
+        count: ir.Value,
     ) -> None:
         self.c, self.line, self.step, self.size, self.count = c, line, step, size, count
         self.positions = _Positions(c, zeta0, step, last)
 
-    def give(self, take: Callable[[Any, Any], None]) -> None:
+    def give(self, take: Callable[[ir.Value, ir.Value], None]) -> None:
         """Call ``take(W steps, index of the first)`` for all of them."""
         c, b = self.c, self.c.b
         if c.width != 8 or not _picks(c):
@@ -156,12 +182,14 @@ class _Steps:
                     self._run(self._one_by_one, take)
 
     def _run(
-        self, pick: Callable[[Any], tuple[Any, Any]], take: Callable[[Any, Any], None]
+        self,
+        pick: Callable[[ir.Value], tuple[ir.Value, ir.Value]],
+        take: Callable[[ir.Value, ir.Value], None],
     ) -> None:
         """The values of a vector stay in registers until those of the next are known."""
         c = self.c
 
-        def values(first: Any) -> Any:
+        def values(first: ir.Value) -> ir.Value:
             k, part = self.positions.at(first)
             low, high = pick(k)
             return c.add(low, c.mul(part, c.sub(high, low)))
@@ -174,7 +202,7 @@ class _Steps:
             take(c.sub(c.shuffle(here, next_, list(range(1, c.width + 1))), here), first)
             c.b.store(next_, held)
 
-    def _one_by_one(self, k: Any) -> tuple[Any, Any]:
+    def _one_by_one(self, k: ir.Value) -> tuple[ir.Value, ir.Value]:
         c = self.c
         pair = ir.VectorType(c.real, 2)
         low = high = ir.Constant(c.wide, ir.Undefined)
@@ -193,7 +221,7 @@ class _Steps:
 class _Positions:
     """Lower knots and what the positions exceed them by."""
 
-    def __init__(self, c: Any, zeta0: Any, step: Any, last: Any) -> None:
+    def __init__(self, c: _Code, zeta0: ir.Value, step: ir.Value, last: ir.Value) -> None:
         self.c, self.integers = c, ir.VectorType(ir.IntType(32), c.width)
         self.zeta0, self.step = c.splat(zeta0, c.width), c.splat(step, c.width)
         self.top = c.splat(c.b.sitofp(last, c.real), c.width)
@@ -201,7 +229,7 @@ class _Positions:
         self.highest = c.splat(highest, c.width)
         self.steps = ir.Constant(c.wide, [ir.Constant(c.real, float(i)) for i in range(c.width)])
 
-    def at(self, first: Any) -> tuple[Any, Any]:
+    def at(self, first: ir.Value) -> tuple[ir.Value, ir.Value]:
         c = self.c
         i = c.add(c.splat(c.b.sitofp(first, c.real), c.width), self.steps)
         zeta = c.clamp(c.add(self.zeta0, c.mul(self.step, i)), self.top)
@@ -211,8 +239,13 @@ class _Positions:
 
 
 def _pick(
-    c: Any, line: Any, size: Any, k: Any, vectors: int, lowest: Any = None
-) -> tuple[Any, Any]:
+    c: _Code,
+    line: ir.Value,
+    size: ir.Value,
+    k: ir.Value,
+    vectors: int,
+    lowest: ir.Value | None = None,
+) -> tuple[ir.Value, ir.Value]:
     """Knots ``k`` and ``k + 1`` out of ``vectors`` registers of 8 knots that begin at ``lowest``,
     by default the first of ``k``."""
     kind = ir.FunctionType(c.wide, [c.wide, k.type])

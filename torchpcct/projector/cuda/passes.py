@@ -32,8 +32,8 @@ class GpuPasses:
         self,
         tables: Tables,
         device: torch.device,
-        cells: Any,
-        axes: Any,
+        cells: object,
+        axes: object,
         nearest: float,
         layers_per_slab: float,
     ) -> None:

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING
 
 from torchpcct.scene.bodies import EllipticCylinder
 from torchpcct.scene.scene import Body, Scene
 from torchpcct.validate import checked, number
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from torchpcct.scene.materials import Material
+
 
 __all__ = ["ctdi", "water_cylinder"]
 
@@ -19,8 +25,8 @@ CTDI_HOLES = ("centre", "peripheral_0", "peripheral_90", "peripheral_180", "peri
 def water_cylinder(
     diameter: float = 200.0,
     length: float = math.inf,
-    material: Any = "water",
-    position: Any = (0.0, 0.0, 0.0),
+    material: Material | str = "water",
+    position: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Scene:
     """One upright cylinder, of water by default; body ``"cylinder"``.
 

@@ -15,11 +15,15 @@ the mediastinum.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING
 
 from torchpcct.scene.bodies import EllipticCylinder
 from torchpcct.scene.scene import Body, Scene
 from torchpcct.validate import checked, numbers
+
+if TYPE_CHECKING:
+    from torchpcct.scene.materials import Material
+
 
 __all__ = ["thorax"]
 
@@ -72,10 +76,10 @@ def _cylinder(
 
 @checked
 def thorax(
-    center: Any = (-HEART_CENTER_MM[0], -HEART_CENTER_MM[1]),
+    center: object = (-HEART_CENTER_MM[0], -HEART_CENTER_MM[1]),
     *,
-    blood: Any = "blood",
-    myocardium: Any = "heart",
+    blood: Material | str = "blood",
+    myocardium: Material | str = "heart",
 ) -> Scene:
     """The thorax, by default with the heart at the isocentre.
 

@@ -247,7 +247,9 @@ def _gap(lumen: NarrowedTube, center: tuple[float, ...], axes: tuple[float, ...]
 
 
 @checked
-def interpolate_material(name: str, start: Any, end: Any, weight: float) -> Material:
+def interpolate_material(
+    name: str, start: Material | str, end: Material | str, weight: float
+) -> Material:
     """A material whose attenuation lies at ``weight`` of the way between two others, at every
     energy.
 
@@ -285,11 +287,11 @@ def plaque_scene(
     plaque: Plaque | None = None,
     *,
     patient_diameter: float = PATIENT_DIAMETER,
-    fat: Any = "pericoronary_fat",
-    wall: Any = "vessel_wall",
-    fibrous: Any = "fibrous_tissue",
-    core: Any = "necrotic_core",
-    blood: Any = "blood_iodine",
+    fat: Material | str = "pericoronary_fat",
+    wall: Material | str = "vessel_wall",
+    fibrous: Material | str = "fibrous_tissue",
+    core: Material | str = "necrotic_core",
+    blood: Material | str = "blood_iodine",
     core_contrast: float = 1.0,
     motion_amplitude: float = 0.0,
     motion: SinusoidalMotion | None = None,

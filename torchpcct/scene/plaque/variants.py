@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +19,10 @@ from torchpcct.scene.materials import calcification
 from torchpcct.scene.plaque.plaque import PAPER_POSITION, Plaque, interpolate_material, plaque_scene
 from torchpcct.scene.scene import Body, Scene
 from torchpcct.validate import checked, choice, whole
+
+if TYPE_CHECKING:
+    from torchpcct.scene.materials import Material
+
 
 __all__ = ["VARIANTS", "plaque_variant"]
 
@@ -41,7 +45,7 @@ def calcification_bodies(plaque: Plaque) -> tuple[Body, ...]:
 
 @checked
 def stent_bodies(
-    plaque: Plaque, *, rings: int = 5, blood: Any = "blood_iodine"
+    plaque: Plaque, *, rings: int = 5, blood: Material | str = "blood_iodine"
 ) -> tuple[Body, ...]:
     """A stent-like row of rings of cobalt chromium along the lumen's wall, with blood inside each
     ring.
@@ -72,7 +76,7 @@ def stent_bodies(
             raise ValueError(
                 f"ring {k}: strut {_STRUT_MM:g} mm does not fit the lumen's radius of {radius:g} mm"
             )
-        place = {
+        place: dict[str, Any] = {
             "position": tuple(plaque.to_scanner((centre, 0.0, z))),
             "rotation": plaque.orientation,
         }
@@ -94,7 +98,7 @@ def textured(
     *,
     count: int = 60,
     radius: tuple[float, float] = (0.06, 0.18),
-    towards: Any = "water",
+    towards: Material | str = "water",
     strength: float = 0.5,
     around: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None,
 ) -> Scene:
