@@ -54,14 +54,6 @@ class NormalOperator(Protocol):
         ...
 
 
-class OperatorModel(Protocol):
-    """What a model of AᵀWA knows, see :class:`NormalOperator`."""
-
-    def periodic_spectrum(self) -> Tensor: ...
-
-    def information(self, mu_per_hu: float, frequency: float = ...) -> float: ...
-
-
 class Projected:
     """AᵀWA by one projection and one backprojection: exact.
 
@@ -72,9 +64,7 @@ class Projected:
             ``information``), and what may propose its steps.
     """
 
-    def __init__(
-        self, projector: Projector, weigh: Callable[[Tensor], Tensor], model: OperatorModel
-    ) -> None:
+    def __init__(self, projector: Projector, weigh: Callable[[Tensor], Tensor], model: Any) -> None:
         self.projector, self.weigh, self.model = projector, weigh, model
 
     def apply(self, x: Tensor) -> Tensor:

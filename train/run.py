@@ -95,7 +95,11 @@ def _averaged(model: nn.Module, ema: float) -> AveragedModel:
     """Moving average of parameters and buffers; it starts at the weights of now."""
 
     @torch.no_grad()
-    def mix(averages: list[Tensor], fresh: list[Tensor], count: Tensor | int) -> None:
+    def mix(
+        averages: tuple[Tensor, ...] | list[Tensor],
+        fresh: tuple[Tensor, ...] | list[Tensor],
+        count: Tensor | int,
+    ) -> None:
         if not averages[0].is_floating_point():
             torch._foreach_copy_(averages, fresh)
             return

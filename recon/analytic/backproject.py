@@ -495,7 +495,8 @@ class BackprojectionPlan:
             return np.tile([0, nx], (ny, 1))
         seen: NDArray[np.bool_] = np.logical_not(self.mask)
         first, last = seen.argmax(axis=1), nx - seen[:, ::-1].argmax(axis=1)
-        return np.where(seen.any(axis=1)[:, None], np.stack([first, last], axis=1), 0)
+        some = np.asarray(seen.any(axis=1))
+        return np.where(some[:, None], np.stack([first, last], axis=1), 0)
 
     def transpose(self, volume: Tensor) -> Tensor:
         """``(..., [z,] y, x)`` to ``(..., views, [rows,] columns)``: the exact transpose of

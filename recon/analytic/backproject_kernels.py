@@ -1,3 +1,4 @@
+# mypy: disable-error-code="call-arg"
 """Numba kernels of the voxel-driven backprojector and of its exact transpose.
 
 Every voxel belongs to one task of the backprojection and every view to one task of the transpose,

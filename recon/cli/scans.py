@@ -540,9 +540,8 @@ def _reconstruct(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         found = execute.run(jobs, folder, executor, progress) if executor is not None else {}
         for k, job in enumerate(jobs):
             progress("scans", k / len(jobs))
-            print_outcome(
-                job.name, *(found[job.name] if found else job.function(folder, *job.args))
-            )
+            outcome: Any = found[job.name] if found else job.function(folder, *job.args)
+            print_outcome(job.name, *outcome)
     for out in outs:
         if _note(folder / f"{out}{_DONE}"):
             (folder / f"{out}{_DONE}").unlink(missing_ok=True)

@@ -202,7 +202,7 @@ def _named(spec: str) -> Method:
     return _of_function(spec, loaded(spec))
 
 
-def denoiser(function: Callable[..., object], base: object, name: str = "") -> Method:
+def denoiser(function: Callable[..., object], base: MethodLike, name: str = "") -> Method:
     """A function of an image after a linear method.
 
     Args:

@@ -93,7 +93,7 @@ class SimulationConfig:
     exposure_s: float | None
     seed: int
     tolerance_hu: float
-    values: dict[str, object]
+    values: dict[str, Any]
 
 
 def read_config(path: Path, **changes: object) -> SimulationConfig:
