@@ -261,5 +261,6 @@ def figures(measured: Measured) -> dict[str, Figure]:
         axes.grid(axis="y", color="0.9")
         axes.set_axisbelow(True)
     panels[0].set_ylabel("contrast shown / true contrast")
-    panels[-1].legend(fontsize=7, frameon=False, loc="upper right")
+    handles, labels = panels[-1].get_legend_handles_labels()
+    figure.legend(handles, labels, fontsize=8, frameon=False, loc="outside lower center", ncols=4)
     return {"recovery.png": figure}
