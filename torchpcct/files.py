@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from types import FrameType
 
     import h5py
-    from typing_extensions import Buffer
 
 
 __all__ = ["WriteError"]
@@ -239,7 +238,7 @@ class _Unfailing(io.FileIO):
 
     failure: BaseException | None = None
 
-    def write(self, data: Buffer, /) -> int:
+    def write(self, data: Any, /) -> int:
         rest = memoryview(data).cast("B")
         size = len(rest)
         try:

@@ -71,9 +71,15 @@ def test_members_of_a_scan_are_checked(clean):
         ),
         ("surround readings", lambda: replace(s, surround=s.surround * math.nan)),
         ("surround readings", lambda: replace(s, surround=-s.surround)),
-        ("counts must be a floating point tensor", lambda: replace(s, counts=s.counts.numpy())),
-        ("counts must be a floating point tensor", lambda: replace(s, counts=s.counts.long())),
-        ("air must be a floating point tensor", lambda: replace(s, air=1e5)),
+        (
+            "counts must be a tensor of float32",
+            lambda: replace(s, counts=s.counts.numpy()),
+        ),
+        (
+            "counts must be a tensor of float32",
+            lambda: replace(s, counts=s.counts.long()),
+        ),
+        ("air must be a tensor of float32", lambda: replace(s, air=1e5)),
         ("geometry must be a ConeBeam", lambda: replace(s, geometry=FanBeam([0.0], 1, 2, 3, 1))),
         ("linearisation must be a WaterLinearisation", lambda: replace(s, linearisation=None)),
         ("window must be a DetectorWindow", lambda: replace(s, window="all")),
