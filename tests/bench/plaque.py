@@ -255,7 +255,7 @@ class Draws:
             return
         with torch.no_grad():
             b, _ = self.drawn(what.scene, what.exposure_s, k)
-            volume = network(self.problem, b[None], what.exposure_s)[0]
+            volume = network(self.problem.term_of(b[None], what.exposure_s))[0]
         with np.load(path.with_suffix(".npz")) as shares:
             found["mbir"] = read_regions({n: shares[n] / 255.0 for n in shares.files}, volume)
         with atomic_write(path) as part:

@@ -94,7 +94,7 @@ def figures(network: Mbir, bench: Bench) -> dict[str, Any]:
     pairs = [(bench.held_out(d), bench.held_out(d, core=False)) for d in DIRECTIONS]
 
     def volume(b: Tensor, dose: float) -> Tensor:
-        return network(bench.problem, b[None], dose)[0]
+        return network(bench.problem.term_of(b[None], dose))[0]
 
     for dose in DOSES:
         rows = []
