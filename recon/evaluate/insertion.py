@@ -31,12 +31,12 @@ from torch import Tensor
 from recon.api import reconstruct
 from recon.evaluate.measure import volume_of
 from recon.evaluate.methods import Method, MethodLike, listed, method_of, noise_of
-from recon.evaluate.without_truth import MeasuredRealisation, as_slices
+from recon.evaluate.without_truth import MeasuredRealisation, as_slices, require_no_energies
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.recovery import recovered_contrast
 from torchpcct.projector import Projector
 from torchpcct.scan import Scan
-from torchpcct.scan_grid import cells_at_axis
+from torchpcct.scan_grid import finite_cells
 from torchpcct.validate import checked, number, whole
 from torchpcct.volume import from_hu
 
@@ -128,8 +128,7 @@ class ContrastRecovery:
     @property
     def standard_error(self) -> float:
         """Of the mean, from the scatter between places (noise and surroundings); NaN of one."""
-        n = len(self.values)
-        return float(np.std(self.values, ddof=1) / math.sqrt(n)) if n > 1 else math.nan
+        return _standard_error(self.values)
 
     @property
     def reference_mean(self) -> float:
@@ -141,12 +140,16 @@ class ContrastRecovery:
         """``more`` or ``less`` than soft FBP shows, by more than two standard errors of the paired
         difference, else ``as much``."""
         d = np.subtract(self.values, self.reference)
-        if len(d) < 2:
-            return "as much"
-        error = 2.0 * float(np.std(d, ddof=1)) / math.sqrt(len(d))
-        if abs(float(d.mean())) <= error:
+        if len(d) < 2 or abs(float(d.mean())) <= 2.0 * _standard_error(d):
             return "as much"
         return "more" if d.mean() > 0 else "less"
+
+    @property
+    def in_percent(self) -> str:
+        """The mean ± two standard errors, in words."""
+        if len(self.values) == 1:
+            return f"{100 * self.mean:.0f} %"
+        return f"{100 * self.mean:.0f} ± {200 * self.standard_error:.0f} %"
 
     def as_dict(self) -> dict[str, object]:
         """JSON values."""
@@ -164,29 +167,29 @@ class ContrastRecovery:
         }
 
     def __str__(self) -> str:
-        share = f"{100 * self.mean:.0f}"
-        if len(self.values) > 1:
-            share += f" ± {200 * self.standard_error:.0f}"
         return (
-            f"a ball of {self.ball}: {self.method} shows {share} % of its contrast, "
+            f"a ball of {self.ball}: {self.method} shows {self.in_percent} of its contrast, "
             f"{self.verdict} {'as' if self.verdict == 'as much' else 'than'} "
             f"{REFERENCE} ({100 * self.reference_mean:.0f} %)"
         )
+
+
+def _standard_error(values: Sequence[float] | Floats) -> float:
+    """Of the mean; NaN of one value."""
+    n = len(values)
+    return float(np.std(values, ddof=1) / math.sqrt(n)) if n > 1 else math.nan
 
 
 def recovery_table(found: Sequence[ContrastRecovery]) -> str:
     """A table in text: for each ball what each method shows of its contrast."""
     rows = [("ball", "places", "method", "contrast shown", "soft FBP", "")]
     for one in found:
-        share = f"{100 * one.mean:.0f}"
-        if len(one.values) > 1:
-            share += f" ± {200 * one.standard_error:.0f}"
         rows.append(
             (
                 str(one.ball),
                 str(len(one.values)),
                 one.method,
-                f"{share} %",
+                one.in_percent,
                 f"{100 * one.reference_mean:.0f} %",
                 one.verdict,
             )
@@ -243,12 +246,7 @@ def contrast_recovery(
     asked = [method_of(m) for m in listed(methods)]
     if not asked:
         raise ValueError("methods must name at least one method")
-    for method in asked:
-        if method.energies is not None:
-            raise ValueError(
-                f"{method.name}: energies= weighs the bins of simulated scans; weigh those of this "
-                "one before (Scan.weighted)"
-            )
+    require_no_energies(asked)
     if scan.counts.ndim > len(scan.geometry.shape) and scan.geometry.has_rows:
         raise ValueError("the scan has several energy bins: weigh them before (Scan.weighted)")
     whole("n", n, low=1)
@@ -323,8 +321,7 @@ def _noise(scan: Scan, grid: VolumeGrid) -> Callable[[Method, float], float]:
 
 def with_balls(scan: Scan, grid: VolumeGrid, ball: InsertedBall, places: Floats) -> Scan:
     """The scan with balls at ``places`` ``(n, axes)`` in mm inserted."""
-    cell = min(c for c in cells_at_axis(scan.geometry) if math.isfinite(c))
-    fine = min(cell, 0.5 * ball.diameter_mm) / _FINE
+    fine = min(*finite_cells(scan.geometry), 0.5 * ball.diameter_mm) / _FINE
     size = math.ceil(ball.diameter_mm / fine) + 2
     axes = 3 if scan.geometry.has_rows else 2
     added = torch.zeros(scan.counts.shape)

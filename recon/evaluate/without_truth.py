@@ -150,12 +150,7 @@ def evaluate_scans(
         )
     given, grid = [as_slices(s, grid)[0] for s in given], as_slices(given[0], grid)[1]
     names = [method_of(m) for m in listed(methods)]
-    weighted = [m.name for m in names if m.energies is not None]
-    if weighted:
-        raise ValueError(
-            f"{', '.join(weighted)}: energies= weighs the bins of simulated scans; weigh those of "
-            "measured ones before, scan.weighted(torchpcct.spectral.bin_weights(…))"
-        )
+    require_no_energies(names)
     generator = np.random.default_rng(seed)
     rows = []
     for k in range(n):
@@ -164,6 +159,17 @@ def evaluate_scans(
         measured = evaluate_volumes(found, reference, grid.spacing, region)
         rows.append([{**row, "note": _note(given[0], grid)} for row in measured])
     return rows[0] if n == 1 else [_mean(list(same)) for same in zip(*rows, strict=True)]
+
+
+def require_no_energies(methods: Sequence[Method]) -> None:
+    """Refuse methods that weigh energy bins (ValueError): those of a given scan are weighed
+    before."""
+    weighted = [m.name for m in methods if m.energies is not None]
+    if weighted:
+        raise ValueError(
+            f"{', '.join(weighted)}: energies= weighs the bins of simulated scans; weigh those of "
+            "measured ones before, scan.weighted(torchpcct.spectral.bin_weights(…))"
+        )
 
 
 def as_slices(scan: Scan, grid: VolumeGrid) -> tuple[Scan, VolumeGrid]:
