@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from recon.cli.parsing import Parser
     from recon.mbir.unrolled import Unrolled
     from train.config import TrainConfig
-    from train.data import Data
+    from train.data import Data, InTurn
     from train.objective import Objective
 
 
@@ -108,7 +108,7 @@ def _parser() -> Parser:
 
 def build(
     config: TrainConfig, views: Path, device: str = "cpu"
-) -> tuple[Unrolled, Data, Data, Objective]:
+) -> tuple[Unrolled, Data | InTurn, Data, Objective]:
     """Model with its starting weights, data of the training and of the validation, and objective.
 
     Args:
@@ -128,7 +128,7 @@ def build(
     from recon.mbir.network import Network
     from recon.mbir.priors import network_of
     from recon.mbir.unrolled import Unrolled
-    from train.data import Data, seed_of
+    from train.data import Data, InTurn, seed_of
     from train.objective import Objective
 
     try:
@@ -149,7 +149,10 @@ def build(
     fast = where.type == "cuda" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
     if isinstance(model.network, Network):
         model.network.half_precision = config.bfloat16 and fast
-    data = Data(config.data, config.seed, views, where)
+    data: Data | InTurn = Data(config.data, config.seed, views, where)
+    if config.late_begins < config.steps:
+        late = Data(config.late_data, seed_of("late", config.seed), views, where)
+        data = InTurn(data, late, config.late_begins)
     few = replace(config.data, scenes_kept=config.objective.held_out)
     held_out = Data(few, seed_of("held out", config.seed), views, where)
     return model, data, held_out, Objective(config.objective, config.single)

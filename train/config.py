@@ -1,16 +1,16 @@
 """Configuration of a training run and its YAML form.
 
 A YAML file holds the fields that differ from the defaults of :class:`TrainConfig`. Sections
-(``network``, ``data``, ``objective``) are mappings. Unknown keys are errors, so that a misspelt one
-does not silently train the default. Every class checks its own values, whether they come from YAML
-or from Python.
+(``network``, ``data``, ``late``, ``objective``) are mappings. Unknown keys are errors, so that a
+misspelt one does not silently train the default. Every class checks its own values, whether they
+come from YAML or from Python.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar
@@ -176,6 +176,32 @@ class DataConfig:
 
 
 @dataclass(frozen=True)
+class LateConfig:
+    """Other scenes in the last part of a training, which the weights keep most of.
+
+    Args:
+        begins: share of the steps after which they are drawn; 1 for never.
+        scenes: changes of :class:`train.scenes.scene.SceneConfig`, instead of those of the data.
+        scenes_kept: different scenes, as of the data.
+
+    Raises:
+        TypeError, ValueError: a value is out of its range, or ``scenes`` has an unknown key.
+    """
+
+    begins: float = 1.0
+    scenes: dict[str, Any] = field(default_factory=dict)
+    scenes_kept: int = 2000
+
+    def __post_init__(self) -> None:
+        _section(SceneConfig, self.scenes, "scenes")
+        _set(
+            self,
+            begins=number("begins", self.begins, low=0.0, high=1.0),
+            scenes_kept=whole("scenes_kept", self.scenes_kept),
+        )
+
+
+@dataclass(frozen=True)
 class ObjectiveConfig:
     """Weights of the terms of :mod:`train.objective` and size of the validation.
 
@@ -263,8 +289,8 @@ class TrainConfig:
             one is cheaper.
         bfloat16: convolve in that precision where the processor has it, in half the time (others
             would imitate it, at twenty times the time, and convolve in float32).
-        data, objective: :class:`DataConfig` and :class:`ObjectiveConfig`, or mappings of their
-            fields.
+        data, late, objective: :class:`DataConfig`, :class:`LateConfig` and
+            :class:`ObjectiveConfig`, or mappings of their fields.
 
     Raises:
         TypeError, ValueError: a value is out of its range, or a section has an unknown key.
@@ -287,6 +313,7 @@ class TrainConfig:
     single: float = 0.5
     bfloat16: bool = True
     data: DataConfig = field(default_factory=DataConfig)
+    late: LateConfig = field(default_factory=LateConfig)
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
 
     def __post_init__(self) -> None:
@@ -312,6 +339,7 @@ class TrainConfig:
                 "checkpoint_seconds", self.checkpoint_seconds, positive=True, high=LONGEST_INTERVAL
             ),
             data=_section(DataConfig, self.data, "data"),
+            late=_section(LateConfig, self.late, "late"),
             objective=_section(ObjectiveConfig, self.objective, "objective"),
         )
         if self.ema >= 1:
@@ -325,6 +353,24 @@ class TrainConfig:
     def decay_begins(self) -> int:
         """Updates after which the learning rate falls."""
         return round(self.steps * (1.0 - self.decay))
+
+    @property
+    def end_begins(self) -> int:
+        """The first step that depends on how many there will be."""
+        o = self.objective
+        flat = round(self.steps * o.flat_from) if o.flat else self.steps
+        fewer = 0 if self.unroll > 1 and self.single else self.steps
+        return min(self.decay_begins, self.late_begins, flat, fewer)
+
+    @property
+    def late_begins(self) -> int:
+        """The first step with the late scenes."""
+        return round(self.steps * self.late.begins)
+
+    @property
+    def late_data(self) -> DataConfig:
+        """What the training draws from then on."""
+        return replace(self.data, scenes=self.late.scenes, scenes_kept=self.late.scenes_kept)
 
     @classmethod
     def from_yaml(cls, text: str) -> Self:

@@ -404,6 +404,30 @@ class Data:
         )
 
 
+class InTurn:
+    """Two sources of scenes, one after the other.
+
+    Args:
+        first: until the step ``begins``.
+        late: from then on.
+        begins: that step.
+    """
+
+    def __init__(self, first: Data, late: Data, begins: int) -> None:
+        self.first, self.late, self.begins = first, late, begins
+
+    def prepare(self, processes: int) -> None:
+        """Compute all views of both beforehand (:meth:`Data.prepare`)."""
+        self.first.prepare(processes)
+        self.late.prepare(processes)
+
+    def batch(self, step: int, batch: int, indices: Sequence[int]) -> Batch:
+        """Scenes of a step of the whole training (:meth:`Data.batch`)."""
+        if step < self.begins:
+            return self.first.batch(step, batch, indices)
+        return self.late.batch(step - self.begins, batch, indices)
+
+
 def _compute_views(config: DataConfig, seed: int, folder: Path, numbers: Sequence[int]) -> None:
     """Paint scenes and keep their views, in a process of its own."""
     data = Data(config, seed, folder)

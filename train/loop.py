@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from torch import nn
 
 from train.config import TrainConfig
-from train.data import Data
+from train.data import Data, InTurn
 from train.logs import Logs
 from train.objective import Objective
 from train.processes import Group, gradient
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 def train(
     config: TrainConfig,
     model: nn.Module,
-    data: Data,
+    data: Data | InTurn,
     held_out: Data,
     objective: Objective,
     out: Path,

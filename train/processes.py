@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, distributed, nn
 
 from train.config import TrainConfig
-from train.data import Data, seed_of
+from train.data import Data, InTurn, seed_of
 from train.objective import Objective
 
 if distributed.is_available():
@@ -47,7 +47,7 @@ class Group:
 def gradient(
     config: TrainConfig,
     model: nn.Module,
-    data: Data,
+    data: Data | InTurn,
     objective: Objective,
     step: int,
     group: Group,

@@ -182,11 +182,12 @@ class Run:
             self.notes.append(warning)
         before = TrainConfig.from_yaml(metadata["config"])
         other = set(differences(self.config.as_dict(), before.as_dict())) - FREE_TO_CHANGE
-        alike = self.config.unroll == 1 or self.config.single == 0.0
-        if alike and metadata["state"]["step"] <= min(
-            self.config.decay_begins, before.decay_begins
-        ):
-            other -= {"steps", "decay", "final_fraction"}  # nothing has depended on them yet
+        reached = metadata["state"]["step"]
+        # What comes later has changed nothing yet.
+        if reached <= min(self.config.end_begins, before.end_begins):
+            other -= {"steps", "decay", "final_fraction", "objective.flat_from"}
+        if reached <= min(self.config.late_begins, before.late_begins):
+            other = {name for name in other if not name.startswith("late.")}
         if other:
             raise ValueError(
                 f"the run in {self.out} has another configuration ({', '.join(sorted(other))}): "

@@ -23,7 +23,7 @@ _FARTHEST = 1.5
 _LESS = 0.9
 """Balls are named of which less than this part of what soft FBP shows is shown."""
 _NAMED = 2
-"""So many, those that lose most."""
+"""So many sizes, the smallest."""
 
 
 class Shown(TypedDict):
@@ -72,11 +72,13 @@ def contrast_note(weights_sha256: str, noise_scale_hu: float, fidelity: float) -
     ]
     if not lost:
         return []
-    lost.sort(key=lambda r: r["recovered"] / r["soft_fbp"])
+    # The ball of each size that loses most.
+    lost.sort(key=lambda r: r["recovered"] / r["soft_fbp"], reverse=True)
+    worst = {r["diameter_mm"]: r for r in lost}
     balls = " and ".join(
         f"{100 * r['recovered']:.0f} % of a ball of {r['diameter_mm']:g} mm and "
         f"{r['contrast_hu']:+g} HU (soft FBP {100 * r['soft_fbp']:.0f} %)"
-        for r in lost[:_NAMED]
+        for _, r in sorted(worst.items())[:_NAMED]
     )
     return [
         f"small and faint bodies lose contrast by the prior: at such noise MBIR showed {balls}, "

@@ -402,7 +402,7 @@ def training(bench: Bench) -> dict[str, Any]:
         loss = (model(term) - goal).square().mean()
         loss.backward()
         optimiser.step()
-        losses.append(float(loss))
+        losses.append(float(loss.detach()))
         steps += 1
         if steps == 2:  # without what is compiled and tuned at first
             begun = time.perf_counter()

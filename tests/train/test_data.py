@@ -12,7 +12,7 @@ import torch
 
 from recon.mbir.unrolled import first_views
 from train.config import DataConfig, Situation
-from train.data import ROIS, Data, Views, turn
+from train.data import ROIS, Data, InTurn, Views, turn
 
 CONFIG = DataConfig(
     shape=(16, 12, 12),
@@ -55,6 +55,16 @@ def test_an_epoch_takes_every_scene_once(data):
         )
     assert epochs[0] != epochs[1]
     assert data.batches_in_epoch(5) == 4
+
+
+def test_late_scenes_come_after_the_others(data, tmp_path):
+    late = Data(replace(CONFIG, scenes={"free_probability": 1.0}), 5, tmp_path)
+    late._terms = data._terms
+    both = InTurn(data, late, 5)
+    for step, of, there in ((4, data, 4), (5, late, 0), (6, late, 1)):
+        found, wanted = both.batch(step, BATCH, [1]), of.batch(there, BATCH, [1])
+        assert torch.equal(found.truth, wanted.truth)
+        assert torch.equal(found.problem.b, wanted.problem.b)
 
 
 def test_two_draws_of_noise_are_independent_of_each_other_and_of_other_scenes(data):

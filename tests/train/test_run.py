@@ -250,6 +250,30 @@ def test_a_run_may_be_made_longer_until_the_rate_falls(tmp_path):
         run(tmp_path / "y", long, resume=True)
 
 
+def test_what_comes_at_the_end_may_change_until_it_begins(tmp_path):
+    """Late scenes, and the weight of constant tissue: not after their first step, nor the number
+    of steps, of which they are shares."""
+    late = {"begins": 0.75, "scenes": {"core_probability": 1.0}}
+    run(tmp_path / "x", objective=StubObjective({4: send(signal.SIGTERM)}))
+    run(
+        tmp_path / "x",
+        stub_config(late=late),
+        StubObjective({11: send(signal.SIGTERM)}),
+        resume=True,
+    )
+    other = {"begins": 0.75, "scenes": {"core_probability": 0.5}}
+    with pytest.raises(ValueError, match=r"late\.scenes\.core_probability"):
+        run(tmp_path / "x", stub_config(late=other), resume=True)
+    flat = [
+        stub_config(steps=n, decay=0.0, unroll=1, objective=ObjectiveConfig(flat=1.0, flat_from=f))
+        for n, f in ((STEPS, 0.75), (2 * STEPS, 0.75), (STEPS, 0.9))
+    ]
+    run(tmp_path / "y", flat[0], StubObjective({6: send(signal.SIGTERM)}))
+    run(tmp_path / "y", flat[2], StubObjective({10: send(signal.SIGTERM)}), resume=True)
+    with pytest.raises(ValueError, match="steps"):
+        run(tmp_path / "y", flat[1], resume=True)
+
+
 def test_it_trains_and_the_best_average_is_shipped(uninterrupted):
     validations = rows(uninterrupted / "validation.csv")
     assert [r["step"] for r in validations] == ["5", "10", "12"]

@@ -761,7 +761,7 @@ def test_a_dry_run_lists_the_jobs(here, cli):
 CALLED = """
 import pickle, sys
 from pathlib import Path
-from recon.evaluate.realisations import Draws
+from recon.evaluate.realisations import Realisations
 from recon.evaluate.measure import Measurement, Reader
 from recon.jobs.sources import _follow
 from recon.jobs.store import Store
@@ -778,7 +778,7 @@ def note(frame, event, what):
                 return
 sys.setprofile(note)
 task, methods = pickle.loads(Path(sys.argv[1]).read_bytes())
-draws = Draws(task, Store(Path(sys.argv[2])), 0, [k for m in methods for k in m.kernels])
+draws = Realisations(task, Store(Path(sys.argv[2])), 0, [k for m in methods for k in m.kernels])
 reader = Reader(task, task.truth(draws.ground_truth))
 for m in methods:
     Measurement(m, draws, reader, 20.0)

@@ -24,12 +24,25 @@ def measured(monkeypatch):
     monkeypatch.setattr(shown, "_measured", lambda: ("abc", rows))
 
 
-def test_the_balls_that_lose_most_are_named():
+def test_the_smallest_balls_that_lose_contrast_are_named():
     (text,) = shown.contrast_note("abc", 35.0, 0.5)
-    first = text.index("10 % of a ball of 2 mm and +100 HU (soft FBP 80 %)")
-    assert first < text.index("25 % of a ball of 1 mm")
+    first = text.index("25 % of a ball of 1 mm and +100 HU (soft FBP 69 %)")
+    assert first < text.index("10 % of a ball of 2 mm")
     assert "0.5 mm" not in text  # hardly less than by soft FBP
     assert "3 mm" not in text
+
+
+def test_of_a_size_the_ball_that_loses_most_is_named(monkeypatch):
+    row = {"noise_scale_hu": 40.0, "fidelity": 0.5, "diameter_mm": 1.0, "soft_fbp": 0.69}
+    rows = (
+        {**row, "contrast_hu": 400.0, "recovered": 0.5},
+        {**row, "contrast_hu": -100.0, "recovered": 0.2},
+        {**row, "contrast_hu": 100.0, "recovered": 0.3},
+    )
+    monkeypatch.setattr(shown, "_measured", lambda: ("abc", rows))
+    (text,) = shown.contrast_note("abc", 40.0, 0.5)
+    assert "20 % of a ball of 1 mm and -100 HU" in text
+    assert text.count("a ball") == 1
 
 
 @pytest.mark.parametrize(
