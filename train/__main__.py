@@ -149,10 +149,11 @@ def build(
     fast = where.type == "cuda" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
     if isinstance(model.network, Network):
         model.network.half_precision = config.bfloat16 and fast
-    data: Data | InTurn = Data(config.data, config.seed, views, where)
+    first = Data(config.data, config.seed, views, where)
+    data: Data | InTurn = first
     if config.late_begins < config.steps:
         late = Data(config.late_data, seed_of("late", config.seed), views, where)
-        data = InTurn(data, late, config.late_begins)
+        data = InTurn(first, late, config.late_begins)
     few = replace(config.data, scenes_kept=config.objective.held_out)
     held_out = Data(few, seed_of("held out", config.seed), views, where)
     return model, data, held_out, Objective(config.objective, config.single)

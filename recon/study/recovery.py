@@ -103,8 +103,9 @@ def measure(
 
     ``rows`` of the data, one for each exposure, ball and method: ``exposure_s``, ``diameter_mm``,
     ``contrast_hu``, ``method``, ``recovered`` with its ``standard_error`` (over places and
-    realisations), ``soft_fbp``, ``verdict`` (``less``, ``more`` or ``as much`` as soft FBP), and
-    how many ``balls`` there were. ``noise_scale_hu``: of each exposure.
+    realisations), ``soft_fbp``, ``verdict`` (``less``, ``more`` or ``as much`` as soft FBP), the
+    ``detectability`` d′ of the ball in the readings, and how many ``balls`` there were.
+    ``noise_scale_hu``: of each exposure.
     """
     s = settings
     pieces = Pieces(folder, s)
@@ -211,12 +212,13 @@ def _pooled(exposure_s: float, rows: Sequence[Mapping[str, Any]]) -> dict[str, o
         tuple(v for row in rows for v in row["values"]),
         tuple(v for row in rows for v in row["reference"]),
         tuple(tuple(p) for row in rows for p in row["places_mm"]),
+        float(np.mean([row["detectability"] for row in rows])),
     )
     kept = ("diameter_mm", "contrast_hu", "method", "recovered", "standard_error")
     found = together.as_dict()
     return {
         "exposure_s": exposure_s,
-        **{key: found[key] for key in (*kept, "soft_fbp", "verdict")},
+        **{key: found[key] for key in (*kept, "soft_fbp", "verdict", "detectability")},
         "balls": len(together.values),
     }
 

@@ -1,13 +1,15 @@
 """Balls inserted into a scan: they are what a scan of the object with the balls holds, and what a
 method shows of them is told from what it erases."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from sound_scans import BALL, CYLINDER, Solid, transmissions
 
 from recon.evaluate import InsertedBall, contrast_recovery
-from recon.evaluate.insertion import recovery_table, with_balls
+from recon.evaluate.insertion import detectability_of, recovery_table, with_balls
 from recon.evaluate.without_truth import as_slices
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, full_turn
 
@@ -110,10 +112,45 @@ def test_what_a_method_erases_is_seen(fan):
     assert "less than fbp:soft" in str(halved)
     table = recovery_table([blind, halved]).splitlines()
     shown = (
-        f"4 mm, +60 HU {len(blind.values)} _blind 0 ± 0 % {100 * blind.reference_mean:.0f} % less"
+        f"4 mm, +60 HU {len(blind.values)} {blind.detectability:.1f} _blind 0 ± 0 % "
+        f"{100 * blind.reference_mean:.0f} % less"
     )
     assert table[1].split() == shown.split()
     assert halved.as_dict()["recovered"] == halved.mean
+
+
+@pytest.mark.parametrize("linearisation", [None, (1.0, 0.15)])
+def test_the_ideal_observer_has_the_detectability_that_is_stated(linearisation, fan):
+    """Over noise realisations, Σ w p (y − y₀) has a standard deviation of d′ if w are the inverse
+    variances of the readings y; p is what the ball adds to them, and d′² = Σ w p²."""
+    ball, place = InsertedBall(3.0, 60.0), np.asarray([(0.0, 4.0, -2.0)])
+    photons = PHOTONS * transmissions(fan, [DISC], subs=SUBS)
+    rng = np.random.default_rng(6)
+
+    def scan(readings):
+        found = Scan.from_counts(
+            readings, fan, air=PHOTONS, mu_water=MU, linearisation=linearisation
+        )
+        return as_slices(found, GRID)[0]
+
+    clean, noisy, *draws = (
+        scan(readings) for readings in (photons, *rng.poisson(photons, (81, *photons.shape)) * 1.0)
+    )
+    stack = VolumeGrid((1, 64, 64), 0.75)
+    stated = detectability_of(noisy, stack, ball, place)
+    y = clean.line_integrals()
+    p = with_balls(clean, stack, ball, place).line_integrals() - y
+    weights = noisy.weights()
+    sums = [float((weights * p * (d.line_integrals() - y)).sum()) for d in draws]
+    # 80 draws: the standard deviation is known to 8 %.
+    assert np.std(sums) == pytest.approx(stated, rel=0.25)
+    assert float((weights * p.square()).sum().sqrt()) == pytest.approx(stated, rel=0.01)
+
+
+def test_a_scan_without_noise_has_no_detectability(fan):
+    stack, grid = as_slices(_scan(fan, [DISC]), GRID)
+    scan = replace(stack, exposure_s=None)
+    assert detectability_of(scan, grid, InsertedBall(3.0, 60.0), np.zeros((1, 3))) is None
 
 
 def test_filters_know_the_noise_of_the_scan(fan):
