@@ -51,7 +51,7 @@ from torch import Tensor
 from torchpcct.checks.ray_pairs import BLOCKS, RayPairs, product, unwrapped
 from torchpcct.checks.scan_test import UNKNOWN, ScanTest
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.geometry import Geometry, view_step
+from torchpcct.geometry import ConeBeam, Geometry, view_step
 from torchpcct.validate import checked
 
 __all__ = ["centre_test", "geometry_test"]
@@ -157,7 +157,10 @@ def geometry_test(
         (explained / pairs.here.numel(), "centre" if "rotation centre" in text else "", text)
         for text in centre.findings[:1]
     ]
-    stack = RayPairs.stacked(lines, geometry, window, about) if window is None else pairs
+    # Of a whole cone beam the pairs are those of the plane of the source, which has no rows.
+    stack = pairs
+    if window is None and isinstance(geometry, ConeBeam):
+        stack = RayPairs.stacked(lines, geometry, window, about)
     causes = [(stack, "roll"), (pairs, "scale"), (pairs, "step")]
     for of, name in causes:
         if of is None or of.pattern(name) is None:
@@ -358,7 +361,13 @@ def _tolerance(pairs: RayPairs, name: str) -> float:
 
 
 def _blocks(values: Floats, used: NDArray[np.int64]) -> Floats:
-    return np.array([values[b].sum() for b in np.array_split(used, BLOCKS)])
+    """Sums over equal parts of the views that are used; the first parts hold one more where they
+    are not equal."""
+    kept = values[used]
+    part, more = divmod(used.size, BLOCKS)
+    ends = np.arange(1, BLOCKS + 1) * part + np.minimum(np.arange(1, BLOCKS + 1), more)
+    first = [0, *ends[:-1].tolist()]
+    return np.array([np.add.reduce(kept[a:b]) for a, b in zip(first, ends.tolist(), strict=True)])
 
 
 def _spread(blocks: Floats) -> float:
@@ -368,9 +377,14 @@ def _spread(blocks: Floats) -> float:
 
 def _above(blocks: Floats) -> float:
     """Student's p-value of blocks whose sum should be 0 or less."""
-    from scipy import stats
+    return _student(float(blocks.sum()) / _spread(blocks), blocks.size - 1)
 
-    return float(stats.t.sf(float(blocks.sum()) / _spread(blocks), blocks.size - 1))
+
+def _student(statistic: float, freedom: float) -> float:
+    """Student's p-value of one side."""
+    from scipy import special  # loads with its first use
+
+    return float(special.stdtr(freedom, -statistic))
 
 
 def _fitted(score: Floats, power: Floats, bent: Floats, tolerance: float, parted: float) -> _Fit:
@@ -385,7 +399,7 @@ def _fitted(score: Floats, power: Floats, bent: Floats, tolerance: float, parted
         bent: part of the scores that second order has taken off; half of it may be left.
         parted: squared difference that may look like the cause and is none.
     """
-    from scipy import stats
+    from scipy import special  # loads with its first use
 
     total = float(power.sum())
     size, share = float(score.sum()) / total, power / total
@@ -394,10 +408,8 @@ def _fitted(score: Floats, power: Floats, bent: Floats, tolerance: float, parted
     freedom = 1.0 / float(np.square(share).sum()) - 1.0
     stray = 0.5 * abs(float(bent.sum())) / total + math.sqrt(parted / total)
     beyond = abs(size) - tolerance - stray
-    p_value = (
-        2.0 * float(stats.t.sf(beyond / noise, freedom)) if freedom > 0 and beyond > 0 else 1.0
-    )
-    usual = float(stats.t.ppf(0.975, max(freedom, 1.0)) / stats.norm.ppf(0.975))
+    p_value = 2.0 * _student(beyond / noise, freedom) if freedom > 0 and beyond > 0 else 1.0
+    usual = float(special.stdtrit(max(freedom, 1.0), 0.975) / special.ndtri(0.975))
     error = math.sqrt((usual * noise) ** 2 + (stray / 2.0) ** 2 + (_KNOWN * tolerance) ** 2)
     return _Fit(size, error, min(p_value, 1.0), size**2 * total)
 
@@ -424,7 +436,7 @@ def _mismatch(pairs: RayPairs, false_alarms: float) -> tuple[float, int]:
     used = np.flatnonzero(pairs.known.flatten(1).any(1).numpy())
     if used.size < BLOCKS:
         return math.nan, 0
-    between = pairs.between_views()
+    between = pairs.between_views
     seen = pairs.known.float().sum(0).clamp_min(1.0)
 
     def change(v: Tensor) -> Tensor:
@@ -482,7 +494,7 @@ def _swing(score: Floats, bent: Floats, waves: Floats, parted: float) -> tuple[f
         bent: see :func:`_fitted`.
         parted: amplitude that may be none.
     """
-    from scipy import stats
+    from scipy import special  # loads with its first use
 
     scale = np.abs(waves[:, :1]).mean()
     design, y = waves / scale, score / scale
@@ -505,4 +517,4 @@ def _swing(score: Floats, bent: Floats, waves: Floats, parted: float) -> tuple[f
     statistic = min(
         rest @ np.linalg.solve(covariance[1:, 1:], rest) / 2.0 for covariance in (usual, jackknife)
     )
-    return amplitude, float(stats.f.sf(statistic, 2, freedom))
+    return amplitude, float(special.fdtrc(2, freedom, statistic))

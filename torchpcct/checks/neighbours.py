@@ -429,8 +429,7 @@ class _Views:
             for x in (left, [c[2:-2] for c in change])
         )
         noise = 0.5 * np.square(left[0] - left[1]).reshape(pairs, -1, columns).sum(1)
-        noise = np.stack([_beside(noise[:, k], self.closes) for k in range(columns)], 1)
-        usual = np.stack([_beside(usual[:, k], self.closes) for k in range(columns)], 1)
+        noise, usual = _beside(noise, self.closes), _beside(usual, self.closes)
         off = (square > 0.25 * usual) & (square > 3.0 * noise)
         share: Floats = off[:, self.body].mean(1)
         if self.body.sum() >= _FEW_WINDOWS:
@@ -484,8 +483,10 @@ class _Views:
             patterns.append(("rows", [np.gradient(v, axis=1) for v in values]))
         bends = [v[1:-1] - (v[2:] + v[:-2]) / 2.0 for v in values]
         for along, slope in patterns:
+            power = (slope[0][1:-1] * slope[1][1:-1]).sum((1, 2))
+            product = bends[0] * slope[1][1:-1] + bends[1] * slope[0][1:-1]
             for period in _PERIODS:
-                found = self._alternates(bends, slope, period)
+                found = self._alternates(product, power, period)
                 if found is None:
                     continue
                 size, error = found
@@ -510,25 +511,30 @@ class _Views:
         return best
 
     def _alternates(
-        self, bends: list[Floats], slope: Sequence[Floats], period: int
+        self, product: Floats, slopes: Floats, period: int
     ) -> tuple[float, float] | None:
         """Peak-to-peak shift of views with this period, and its error from the scatter of blocks
-        of views."""
-        n = len(bends[0])
+        of views.
+
+        Args:
+            product: of second differences between views and slopes, of both sets,
+                ``(views, rows, windows)``.
+            slopes: squared, without noise, ``(views,)``.
+            period: in views.
+        """
+        n = len(product)
         index = np.arange(1, n + 1)
         blocks = np.array_split(np.arange(n), 16)
         found, power = [], []
         waves = (np.cos, np.sin) if period > 2 else (np.cos,)
         # Of a wave of this period the second difference keeps 1 − cos.
         keeps = 1.0 - math.cos(2.0 * math.pi / period)
-        total = sum((slope[0][1:-1] * slope[1][1:-1]).sum((1, 2))[b].sum() for b in blocks)
+        total = sum(slopes[b].sum() for b in blocks)
         if total <= 0.0:
             return None
         for wave in waves:
             w = wave(2.0 * math.pi * index / period)[:, None, None]
-            score = (
-                (w * (bends[0] * slope[1][1:-1] + bends[1] * slope[0][1:-1])).sum((1, 2))
-            ) / 2.0
+            score = (w * product).sum((1, 2)) / 2.0
             parts = np.array([score[b].sum() for b in blocks])
             norm = total * keeps * (1.0 if period == 2 else 0.5)
             found.append(float(parts.sum()) / norm)
@@ -537,13 +543,17 @@ class _Views:
 
 
 def _beside(values: Floats, closes: bool) -> Floats:
-    """Median of the values 6 … 14 places before and behind each."""
+    """Median of the values 6 … 14 places before and behind each, along the first axis."""
     n = len(values)
     offsets = np.r_[-14:-5, 6:15]
     at = np.arange(n)[:, None] + offsets
-    inside = (at >= 0) & (at < n)
-    chosen = np.where(inside | closes, values[at % n], np.nan)
-    return np.asarray(np.nanmedian(chosen, axis=1), np.float64)
+    inside = np.full(at.shape, True) if closes else (at >= 0) & (at < n)
+    chosen = values[at % n]  # (places, offsets, …)
+    chosen[~inside] = np.inf  # behind all others
+    chosen.sort(axis=1)
+    count = inside.sum(1)
+    one, other = (chosen[np.arange(n), k] for k in ((count - 1) // 2, count // 2))
+    return np.asarray((one + other) / 2.0, np.float64)
 
 
 def _largest(values: Floats, k: int) -> bool:

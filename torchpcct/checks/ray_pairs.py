@@ -7,9 +7,10 @@ The ray of source angle β and fan angle γ is met again by that of β + π − 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -53,12 +54,13 @@ class RayPairs:
         self._at = np.arange(0, angles.size, max(1, math.ceil(values.numel() / _MOST)))
         self.base = self._order[self._at]
         self.angles = angles[self.base]
-        self.here, self.conjugate, self.known = self._with_conjugates(self.base)
+        self.here = self._values[torch.from_numpy(self.base)]
+        self.conjugate, self.known = rays.interpolated(self._values, self._places)
         self.difference = self.here - self.conjugate
         self.parted = parted * float(self.known.sum())
         self._slopes: dict[tuple[str, int], tuple[Any, ...]] = {}
         self._whole: dict[int, Tensor] = {}
-        self._beside: Any = None
+        self._used: dict[int, NDArray[np.int64]] = {}
 
     @classmethod
     def of(
@@ -100,7 +102,17 @@ class RayPairs:
             geometry, window, values = _joined_rows(geometry, window, values)
         return cls(ConjugateRays(geometry, window, about), values, parted)
 
-    def _with_conjugates(self, views: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor]:
+    @cached_property
+    def _places(self) -> Places:
+        """Where the conjugates of all readings lie."""
+        return self.rays.places(self.base)
+
+    def _with_conjugates(self, way: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Readings and conjugates of the views that lie so many places behind each."""
+        n = self._order.size
+        if self._at.size == n:  # all views: they are looked up already
+            return tuple(v.roll(-way, 0) for v in (self.here, self.conjugate, self.known))  # type: ignore[return-value]
+        views = self._order[(self._at + way) % n]
         return self._values[torch.from_numpy(views)], *self.rays.conjugate(self._values, views)
 
     def shifted(self) -> Pattern:
@@ -129,61 +141,62 @@ class RayPairs:
             factor = 2.0 * gamma
         else:
             turned = unwrapped(self.rays.geometry.angles)
-            places, _ = self.rays.places(self.base)
             factor = (
-                sum(part * turned[views] for views, part, *_ in places) - turned[self.base][:, None]
+                sum(end.part * turned[end.views] for end in self._places.ends)
+                - turned[self.base][:, None]
             )
         return torch.from_numpy(factor)[:, None].float(), "angles"
 
     def whole(self, columns: int) -> Tensor:
         """A slope reaches over neighbours: all of them must have a conjugate."""
         if columns not in self._whole:
-            known = -self.known.float()[:, None]
-            self._whole[columns] = (
-                -F.max_pool2d(known, (1, 2 * columns + 1), 1, (0, columns))[:, 0] > 0.5
-            )
+            width = self.known.shape[-1]
+            missing = F.pad((~self.known).cumsum(-1, dtype=torch.int32), (1, 0))
+            at = torch.arange(width)
+            first, end = (at - columns).clamp_min(0), (at + columns + 1).clamp_max(width)
+            self._whole[columns] = missing[..., end] == missing[..., first]
         return self._whole[columns]
 
     def used(self, columns: int) -> NDArray[np.int64]:
-        return np.flatnonzero(self.whole(columns).flatten(1).any(1).numpy())
+        """Views in which a slope is known."""
+        if columns not in self._used:
+            self._used[columns] = np.flatnonzero(self.whole(columns).flatten(1).any(1).numpy())
+        return self._used[columns]
 
     def slopes(self, along: str, columns: int) -> tuple[Any, ...]:
         """Smoothed slopes of both rays, raw ones of both, and where they are known."""
         if (along, columns) not in self._slopes:
-            pairs = [
-                [_slope(v, *size) for v in (self.here, self.conjugate)]
-                for size in ((_ROWS, columns), (1, columns // 5))
-            ]
-            known = self.whole(columns)
-            if along == "angles":
-                (before, behind), step, rate = self.beside()
-                for size, slopes in zip(((_ROWS, columns), (1, columns // 5)), pairs, strict=True):
-                    for k, slope in enumerate(slopes):
-                        turned = _smooth(behind[k] - before[k], *size) / step
-                        slopes[k] = turned - rate * slope
+            sizes, known = ((_ROWS, columns), (1, columns // 5)), self.whole(columns)
+            if along == "columns":
+                pairs = _filtered((self.here, self.conjugate), _difference, sizes)
+            else:
+                (before, behind), step, rate = self.beside
+                changes = (behind[0] - before[0], behind[1] - before[1])
+                pairs = [[v / step for v in both] for both in _filtered(changes, _mean, sizes)]
+                if bool((rate != 0.0).any()):  # of a window that moves with the views
+                    pairs = [
+                        [turned - rate * slope for turned, slope in zip(*both, strict=True)]
+                        for both in zip(pairs, self.slopes("columns", columns)[:2], strict=True)
+                    ]
                 known = known & before[2] & behind[2]
             self._slopes[along, columns] = (*pairs, known)
         return self._slopes[along, columns]
 
+    @cached_property
     def beside(self) -> Any:
         """The views before and behind, the angle between them, and the columns that a window
         moves per rad."""
-        if self._beside is None:
-            n, turn = self._order.size, self.rays.geometry.angles % (2 * math.pi)
-            ends = [self._order[(self._at + k) % n] for k in (-1, 1)]
-            step = (turn[ends[1]] - turn[ends[0]]) % (2 * math.pi)
-            good = (step > 1e-9) & (step <= 2.0 * _GAP_STEPS * view_step(self.rays.geometry.angles))
-            step = np.where(good, step, 1.0)
-            first = self.rays.window.first_column
-            rate = (first[ends[1]] - first[ends[0]]) / step
-            looked = [self._with_conjugates(e) for e in ends]
-            mask = torch.from_numpy(good)[:, None, None]
-            sides = [(*part[:2], part[2] & mask) for part in looked]
-            self._beside = (
-                sides,
-                *(torch.from_numpy(v)[:, None, None].float() for v in (step, rate)),
-            )
-        return self._beside
+        n, turn = self._order.size, self.rays.geometry.angles % (2 * math.pi)
+        ends = [self._order[(self._at + k) % n] for k in (-1, 1)]
+        step = (turn[ends[1]] - turn[ends[0]]) % (2 * math.pi)
+        good = (step > 1e-9) & (step <= 2.0 * _GAP_STEPS * view_step(self.rays.geometry.angles))
+        step = np.where(good, step, 1.0)
+        first = self.rays.window.first_column
+        rate = (first[ends[1]] - first[ends[0]]) / step
+        looked = [self._with_conjugates(k) for k in (-1, 1)]
+        mask = torch.from_numpy(good)[:, None, None]
+        sides = [(*part[:2], part[2] & mask) for part in looked]
+        return sides, *(torch.from_numpy(v)[:, None, None].float() for v in (step, rate))
 
     def sums(self, pattern: Pattern, columns: int) -> tuple[Floats, Floats, Floats] | None:
         """Score and power of a pattern in every view, and which part of the score interpolation
@@ -200,18 +213,19 @@ class RayPairs:
         )
         return score, power, bent
 
+    @cached_property
     def between_views(self) -> Tensor:
         """How far readings lie from the mean of those in the views before and behind."""
-        (before, behind), *_ = self.beside()
+        (before, behind), *_ = self.beside
         difference: Tensor = self.here - (before[0] + behind[0]) / 2
         return difference
 
     @cached_property
     def curvature(self) -> Tensor:
         """By how much the conjugate is too low for having been interpolated in straight lines."""
-        return self.rays.curvature(self._values, self.base, self.between_views())
+        return self.rays.curvature(self._values, self._places, self.between_views)
 
-    @property
+    @cached_property
     def residue(self) -> Tensor:
         """The difference without what interpolation leaves, to second order."""
         return self.difference - self.curvature
@@ -339,19 +353,41 @@ def _joined_rows(geometry: ConeBeam, window: DetectorWindow, values: Tensor) -> 
     return wider, window.with_rows(0, rows), values
 
 
-def _slope(values: Tensor, rows: int, columns: int) -> Tensor:
-    """Central difference along the columns, averaged over ``rows`` (of a smaller stack less) ×
-    ``columns`` (odd)."""
+def _difference(columns: int) -> Tensor:
+    """Central difference along the columns, averaged over so many (odd)."""
     kernel = torch.zeros(columns + 2)
     for k in range(columns):
         kernel[k] -= 0.5
         kernel[k + 2] += 0.5
-    return _convolved(values, rows, kernel / columns)
+    return kernel / columns
 
 
-def _smooth(values: Tensor, rows: int, columns: int) -> Tensor:
-    """Mean over ``rows`` (of a smaller stack less) × ``columns`` (odd)."""
-    return _convolved(values, rows, torch.full((columns,), 1.0 / columns))
+def _mean(columns: int) -> Tensor:
+    """Mean over so many columns (odd)."""
+    return torch.full((columns,), 1.0 / columns)
+
+
+def _filtered(
+    pair: tuple[Tensor, Tensor],
+    kernel_of: Callable[[int], Tensor],
+    sizes: tuple[tuple[int, int], ...],
+) -> list[list[Tensor]]:
+    """Two stacks ``(views, rows, columns)`` under the kernels of several sizes, rows (of a smaller
+    stack less) × columns; of each size both."""
+    kernels = [kernel_of(columns) for _, columns in sizes]
+    if pair[0].shape[1] > 1:
+        return [
+            [_convolved(v, rows, kernel) for v in pair]
+            for (rows, _), kernel in zip(sizes, kernels, strict=True)
+        ]
+    # Of single rows the views make one image, and all kernels are applied at once.
+    width = max(kernel.numel() for kernel in kernels)
+    bank = torch.stack([F.pad(k, ((width - k.numel()) // 2,) * 2) for k in kernels])
+    images = F.pad(
+        torch.stack([v[:, 0] for v in pair])[:, None], (width // 2,) * 2 + (0, 0), mode="replicate"
+    )
+    found = F.conv2d(images, bank[:, None, None])
+    return [[found[k, size].unsqueeze(1) for k in range(2)] for size in range(len(sizes))]
 
 
 def _convolved(values: Tensor, rows: int, kernel: Tensor) -> Tensor:
@@ -384,6 +420,9 @@ class ConjugateRays:
     def path(self, beta: Floats) -> tuple[Floats, Floats]:
         """Fan angle (parallel: position in mm) of the point that is followed, and its depth from
         the source."""
+        if self.radius == 0.0:  # the axis, which all views see alike
+            depth = 1.0 if self.parallel else self.geometry.sod
+            return np.zeros_like(beta), np.full_like(beta, depth)
         across = self.radius * np.sin(self.polar - beta)
         if self.parallel:
             return across, np.ones_like(across)
@@ -397,15 +436,18 @@ class ConjugateRays:
 
         Each pair counts once, with its ray of positive fan angle.
         """
-        places, known = self.places(base)
+        return self.interpolated(values, self.places(base))
+
+    def interpolated(self, values: Tensor, places: Places) -> tuple[Tensor, Tensor]:
+        """:meth:`conjugate` of the views whose :meth:`places` are known."""
+        known = places.known
         total = torch.zeros(known.shape)
-        for views, part, row, column in places:
-            found, inside = _bilinear(values, views, row, column)
-            total += torch.from_numpy(part)[:, None].float() * found
-            known &= inside
+        for end in places.ends:
+            total += end.share * end.of(values)
+            known = known & end.inside
         return total, known
 
-    def curvature(self, values: Tensor, base: NDArray[np.int64], between: Tensor) -> Tensor:
+    def curvature(self, values: Tensor, places: Places, between: Tensor) -> Tensor:
         """By how much :meth:`conjugate` is too low, to second order, since it is interpolated in
         straight lines.
 
@@ -413,31 +455,23 @@ class ConjugateRays:
         the way.
 
         Args:
-            values, base: see :meth:`conjugate`.
+            values: see :meth:`conjugate`.
+            places: of the conjugates.
             between: ``(base, rows, columns)``, how far the readings themselves lie from the mean of
                 those in the views before and behind, -D / 2 along the views, which their conjugates
                 share.
         """
         bend = F.pad(values[..., 2:] - 2.0 * values[..., 1:-1] + values[..., :-2], (1, 1))
-        places, known = self.places(base)
-        total = torch.zeros(known.shape)
-        for views, part, row, column in places:
-            way = column - np.floor(column)
-            part = part * -0.5 * way * (1.0 - way)
-            total += (
-                torch.from_numpy(part)[:, None].float() * _bilinear(bend, views, row, column)[0]
-            )
-        share = places[1][1]
+        total = torch.zeros(places.known.shape)
+        for end in places.ends:
+            way = end.column - np.floor(end.column)
+            part = end.part * -0.5 * way * (1.0 - way)
+            total += torch.from_numpy(part)[:, None].float() * end.of(bend)
+        share = places.ends[1].part
         return total + torch.from_numpy(share * (1.0 - share))[:, None].float() * between
 
-    def places(
-        self, base: NDArray[np.int64]
-    ) -> tuple[list[tuple[NDArray[np.int64], Floats, Floats, Floats]], Tensor]:
-        """The two views that conjugates lie between, the part, row and column of each; and which
-        rays have a pair.
-
-        Views and parts are ``(base, columns)``.
-        """
+    def places(self, base: NDArray[np.int64]) -> Places:
+        """Where the conjugates of the readings of the views ``base`` lie."""
         g, w = self.geometry, self.window
         gamma = self.fan_angles(base)
         turn = g.angles % (2 * math.pi)
@@ -451,12 +485,13 @@ class ConjugateRays:
         )
         share = before / np.maximum(before + behind, 1e-12)
         close = before + behind <= _GAP_STEPS * view_step(g.angles) + 1e-9
-        known = torch.from_numpy((gamma > 0) & close)[:, None].expand(-1, w.rows, -1).clone()
+        known = torch.from_numpy((gamma > 0) & close)[:, None].expand(-1, w.rows, -1)
         target, depth = self.path(beta)
         own_depth = self.path(turn[base])[1][:, None]
-        places = []
+        across, away = self.path(turn)
+        found = []
         for views, part in zip(ends, (1.0 - share, share), strict=True):
-            there, depth = self.path(turn[views])
+            there, depth = across[views], away[views]
             angle = there - target - gamma
             flat = not self.parallel and g.detector == "flat"
             position = angle if self.parallel else g.sdd * (np.tan(angle) if flat else angle)
@@ -466,28 +501,62 @@ class ConjugateRays:
                 * (own_depth / depth)[:, None]
             )
             pitch = self.rows[1] - self.rows[0] if self.rows.size > 1 else 1.0
-            places.append((views, part, (height - self.rows[0]) / pitch - w.first_row, column))
-        return places, known
+            row = (height - self.rows[0]) / pitch - w.first_row
+            found.append(Place(views, part, row, column, w.rows, w.columns))
+        return Places(found, known)
 
 
-def _bilinear(
-    values: Tensor, views: NDArray[np.int64], row: Floats, column: Floats
-) -> tuple[Tensor, Tensor]:
-    """``values[views, row, column]`` between rows and columns, ``(base, rows, columns)``, and
-    what lies inside."""
-    rows, columns = values.shape[1:]
-    inside = torch.from_numpy((column >= 0) & (column <= columns - 1))[:, None]
-    inside = inside & torch.from_numpy((row >= -0.5) & (row <= rows - 0.5))
-    at = torch.from_numpy(np.clip(column, 0, columns - 1))[:, None]
-    up = torch.from_numpy(np.clip(row, 0, rows - 1))
-    view = torch.from_numpy(views)[:, None]
-    left, low = (
-        at.floor().long().clamp(max=max(columns - 2, 0)),
-        up.floor().long().clamp(max=max(rows - 2, 0)),
-    )
-    right, high = (left + 1).clamp(max=columns - 1), (low + 1).clamp(max=rows - 1)
-    across, along = (at - left).float(), (up - low).float()
-    lower, upper = (
-        torch.lerp(values[view, r, left], values[view, r, right], across) for r in (low, high)
-    )
-    return torch.lerp(lower, upper, along), inside
+class Place:
+    """One of the two views between which conjugates lie, and where in it.
+
+    Args:
+        views, part: number of the view, and its share in the conjugate, ``(base, columns)``.
+        row: fractional, ``(base, rows, columns)``.
+        column: fractional, ``(base, columns)``.
+        rows, columns: of the readings.
+    """
+
+    def __init__(
+        self,
+        views: NDArray[np.int64],
+        part: Floats,
+        row: Floats,
+        column: Floats,
+        rows: int,
+        columns: int,
+    ) -> None:
+        self.views, self.part, self.column = views, part, column
+        self.share = torch.from_numpy(part)[:, None].float()
+        inside = torch.from_numpy((column >= 0) & (column <= columns - 1))[:, None]
+        self.inside = inside & torch.from_numpy((row >= -0.5) & (row <= rows - 0.5))
+        at = np.clip(column, 0, columns - 1)[:, None]
+        left = np.minimum(np.floor(at).astype(np.int64), max(columns - 2, 0))
+        self._across = torch.from_numpy(at - left).float()
+        self._step = min(columns - 1, 1)
+        view = views[:, None] * rows
+        self._along: Tensor | None = None
+        if rows == 1:
+            lines = [view]
+        else:
+            up = np.clip(row, 0, rows - 1)
+            low = np.minimum(np.floor(up).astype(np.int64), rows - 2)
+            self._along = torch.from_numpy(up - low).float()
+            lines = [view + low, view + low + 1]
+        self._places = [torch.from_numpy(k * columns + left) for k in lines]
+
+    def of(self, values: Tensor) -> Tensor:
+        """Readings ``(views, rows, columns)`` between rows and columns, ``(base, rows,
+        columns)``."""
+        flat = values.reshape(-1)
+        found = [
+            torch.lerp(flat[left], flat[left + self._step], self._across) for left in self._places
+        ]
+        return found[0] if self._along is None else torch.lerp(*found, self._along)
+
+
+class Places(NamedTuple):
+    """Where conjugates lie: between two views; and which rays have a pair, ``(base, rows,
+    columns)``."""
+
+    ends: list[Place]
+    known: Tensor

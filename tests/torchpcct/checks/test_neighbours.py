@@ -14,7 +14,7 @@ from refusals import refused
 
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, VolumeGrid, full_turn
 from torchpcct.checks.moments import moment_test
-from torchpcct.checks.neighbours import neighbour_test, stuck_views
+from torchpcct.checks.neighbours import _beside, neighbour_test, stuck_views
 
 VIEWS = 180
 PHOTONS = 2e5
@@ -250,3 +250,13 @@ def test_wrong_input_is_refused():
     assert neighbour_test(torch.zeros(g.shape), g).findings == ()
     few = g.select(slice(10))
     assert neighbour_test(torch.zeros(few.shape), few).sizes == {}
+
+
+@pytest.mark.parametrize("closes", [True, False])
+def test_what_lies_beside_is_the_median_of_the_places_there_are(closes):
+    values = np.random.default_rng(0).normal(size=(31, 2))
+    found = _beside(values, closes)
+    for k in (0, 3, 15, 30):
+        places = [p for p in range(k - 14, k + 15) if abs(p - k) > 5]
+        inside = [p % 31 for p in places if closes or 0 <= p < 31]
+        assert found[k] == pytest.approx(np.median(values[inside], axis=0), abs=0.0)
