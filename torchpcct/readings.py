@@ -389,17 +389,22 @@ def _dispersion(readings: Tensor) -> float:
     n = n[:: max(1, readings.numel() // 2_000_000)].double()
     second = n[:, 2:] - 2.0 * n[:, 1:-1] + n[:, :-2]
     level = (n[:, 2:] + n[:, 1:-1] + n[:, :-2]) / 3.0
-    live = (n[:, 2:] > 0) & (n[:, 1:-1] > 0) & (n[:, :-2] > 0)
+    live = n > 0
+    live = live[:, 2:] & live[:, 1:-1] & live[:, :-2]
     del n
-    level, ratio = level[live], second.square_().div_(6.0 * level)[live]
+    level, ratio = _those(live, level, second.square_().div_(6.0 * level))
+    if ratio.numel() < 8:
+        return math.nan
     # a first guess from all, then without the dim ones, whose noise is not normal
-    for _ in range(2):
-        if ratio.numel() < 8:
-            return math.nan
-        found = float(ratio.median()) * MEDIAN_TO_SD**2
-        bright = level > DIM * found
-        ratio, level = ratio[bright], level[bright]
-    return found
+    guess = float(ratio.median()) * MEDIAN_TO_SD**2
+    (ratio,) = _those(level > DIM * guess, ratio)
+    return math.nan if ratio.numel() < 8 else float(ratio.median()) * MEDIAN_TO_SD**2
+
+
+def _those(which: Tensor, *values: Tensor) -> list[Tensor]:
+    """Values where a mask says so; all of them, which is often, are not copied."""
+    every = bool(which.all())
+    return [v.flatten() if every else v[which] for v in values]
 
 
 def inverse_variance(mean: Tensor, quantum: Tensor, electronic_noise: float) -> Tensor:

@@ -5,6 +5,7 @@ without data it extrapolates, plausibly, and a wrong rotation centre it draws as
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -285,16 +286,8 @@ def _unmeasured_texts(lines: Tensor, geometry: Any, grid: VolumeGrid) -> list[st
     columns = np.flatnonzero(seen)
     if not columns.size:
         return []
-    fan = np.zeros_like(t) if geometry.parallel else geometry.fan_angles
-    lacking = np.zeros(columns.size)
-    for k, column in enumerate(columns):
-        directions = [geometry.angles - fan[column]]
-        if t.min() <= -t[column] <= t.max():
-            directions.append(geometry.angles + fan[column] + math.pi)
-        ordered = np.sort(np.concatenate(directions) % (2.0 * math.pi))
-        lacking[k] = max(np.diff(ordered).max(initial=0.0), ordered[0] + 2 * math.pi - ordered[-1])
     usual = view_step(geometry.angles)
-    lacking -= usual
+    lacking = _gaps(geometry)[columns] - usual
     worst = int(np.argmax(lacking))
     if lacking[worst] <= max(INNER_GAP_RAD, OPEN_GAP_STEPS * usual):
         return []
@@ -304,6 +297,26 @@ def _unmeasured_texts(lines: Tensor, geometry: Any, grid: VolumeGrid) -> list[st
         "along them are smeared, and values beside them wrong by tens of HU; add views until they "
         "cover half a turn and the fan of the object"
     ]
+
+
+@lru_cache(maxsize=16)
+def _gaps(geometry: Any) -> Floats:
+    """Largest angle between directions next to each other in which the lines of each column are
+    measured, ``(columns,)`` rad."""
+    t = reach(geometry)
+    fan = np.zeros_like(t) if geometry.parallel else geometry.fan_angles
+    found = np.zeros(t.size)
+    for column in range(t.size):
+        directions = [geometry.angles - fan[column]]
+        if t.min() <= -t[column] <= t.max():
+            directions.append(geometry.angles + fan[column] + math.pi)
+        # Runs in order are merged.
+        ordered = np.sort(np.concatenate(directions) % (2.0 * math.pi), kind="stable")
+        found[column] = max(
+            np.diff(ordered).max(initial=0.0), ordered[0] + 2 * math.pi - ordered[-1]
+        )
+    found.setflags(write=False)
+    return found
 
 
 def _stuck_texts(scan: Scan, geometry: Geometry) -> list[str]:

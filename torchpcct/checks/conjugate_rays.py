@@ -158,7 +158,7 @@ def geometry_test(
         for text in centre.findings[:1]
     ]
     # Of a whole cone beam the pairs are those of the plane of the source, which has no rows.
-    stack = pairs
+    stack: RayPairs | None = pairs
     if window is None and isinstance(geometry, ConeBeam):
         stack = RayPairs.stacked(lines, geometry, window, about)
     causes = [(stack, "roll"), (pairs, "scale"), (pairs, "step")]
@@ -326,10 +326,8 @@ def _centre(pairs: RayPairs, false_alarms: float) -> tuple[ScanTest, float]:
         sums = pairs.sums(pairs.shifted(), columns)
         if sums is not None:
             turn = 2.0 * pairs.angles
-            waves = [
-                _blocks(sums[1] * wave(turn), pairs.used(columns)) for wave in (np.cos, np.sin)
-            ]
-            score, power, bent = (_blocks(v, pairs.used(columns)) for v in sums)
+            turning = [sums[1] * wave(turn) for wave in (np.cos, np.sin)]
+            score, power, bent, *waves = _blocks(np.stack([*sums, *turning]), pairs.used(columns))
             if power.sum() > 0:
                 design = np.stack([power, *waves], 1)
                 test = _tested(
@@ -361,13 +359,14 @@ def _tolerance(pairs: RayPairs, name: str) -> float:
 
 
 def _blocks(values: Floats, used: NDArray[np.int64]) -> Floats:
-    """Sums over equal parts of the views that are used; the first parts hold one more where they
-    are not equal."""
-    kept = values[used]
+    """Sums of ``(..., views)`` over equal parts of the views that are used, ``(..., BLOCKS)``; the
+    first parts hold one more where they are not equal."""
+    kept = values.take(used, -1)
     part, more = divmod(used.size, BLOCKS)
     ends = np.arange(1, BLOCKS + 1) * part + np.minimum(np.arange(1, BLOCKS + 1), more)
     first = [0, *ends[:-1].tolist()]
-    return np.array([np.add.reduce(kept[a:b]) for a, b in zip(first, ends.tolist(), strict=True)])
+    parts = [kept[..., a:b] for a, b in zip(first, ends.tolist(), strict=True)]
+    return np.stack([np.add.reduce(part, axis=-1) for part in parts], -1)
 
 
 def _spread(blocks: Floats) -> float:
@@ -420,7 +419,7 @@ def _fit(pairs: RayPairs, name: str, columns: int, tolerance: float) -> _Fit | N
     sums = None if pattern is None else pairs.sums(pattern, columns)
     if sums is None:
         return None
-    score, power, bent = (_blocks(v, pairs.used(columns)) for v in sums)
+    score, power, bent = _blocks(np.stack(sums), pairs.used(columns))
     return _fitted(score, power, bent, tolerance, pairs.aligned(name)) if power.sum() > 0 else None
 
 
@@ -442,11 +441,11 @@ def _mismatch(pairs: RayPairs, false_alarms: float) -> tuple[float, int]:
     def change(v: Tensor) -> Tensor:
         return v - torch.where(pairs.known, v, 0.0).sum(0) / seen
 
-    different, stray, *changing = (
-        _blocks(product(v, pairs.known), used)
-        for v in (pairs.difference, between, change(pairs.here), change(pairs.conjugate))
+    changing = [change(pairs.here), change(pairs.conjugate)]
+    different, stray, *changed = _blocks(
+        np.stack([product(v, pairs.known) for v in (pairs.difference, between, *changing)]), used
     )
-    signal = changing[0] + changing[1]
+    signal = changed[0] + changed[1]
     if signal.sum() <= 0:
         return math.nan, 0
     share = float(different.sum() / signal.sum())

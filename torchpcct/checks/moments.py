@@ -102,8 +102,10 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     if isinstance(g, ParallelBeam):
         theta, t = angles, np.asarray(g.column_positions)
     else:
-        theta, both = _parallel(angles, g.fan_angles, np.concatenate([p, lack], 1))
-        p, lack = np.split(both, 2, axis=1)
+        # Of a plane nothing lacks.
+        cone = isinstance(g, ConeBeam)
+        theta, p = _parallel(angles, g.fan_angles, np.concatenate([p, lack], 1) if cone else p)
+        p, lack = np.split(p, 2, axis=1) if cone else (p, np.zeros_like(p))
         t = g.sod * np.sin(g.fan_angles)
     if theta.size < _DIRECTIONS or np.ptp(theta) + view_step(theta) < _LEAST_ARC:
         return UNKNOWN

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +27,8 @@ BLOCKS = 24
 """Parts of the views whose scatter tells the error of a sum."""
 _MOST = 500_000
 """Readings whose conjugates are looked up; more only cost time."""
+_SMALL = 60_000
+"""Readings of a scan whose pairs are kept, in 5 MB."""
 # Views beside a conjugate angle that are farther apart than so many usual steps do not stand for
 # it.
 _GAP_STEPS = 3.0
@@ -49,18 +51,13 @@ class RayPairs:
 
     def __init__(self, rays: ConjugateRays, values: Tensor, parted: float = 0.0) -> None:
         self.rays, self._values = rays, values
-        angles = rays.geometry.angles
-        self._order = np.argsort(angles % (2 * math.pi), kind="stable")
-        self._at = np.arange(0, angles.size, max(1, math.ceil(values.numel() / _MOST)))
-        self.base = self._order[self._at]
-        self.angles = angles[self.base]
-        self.here = self._values[torch.from_numpy(self.base)]
-        self.conjugate, self.known = rays.interpolated(self._values, self._places)
+        self._pairs = pairs = _pairs_of(rays.geometry, rays.window, rays.about)
+        self.base, self.angles, self.known = pairs.base, pairs.angles, pairs.known
+        self.here = values[torch.from_numpy(self.base)]
+        self.conjugate = pairs.places.of(values)
         self.difference = self.here - self.conjugate
         self.parted = parted * float(self.known.sum())
         self._slopes: dict[tuple[str, int], tuple[Any, ...]] = {}
-        self._whole: dict[int, Tensor] = {}
-        self._used: dict[int, NDArray[np.int64]] = {}
 
     @classmethod
     def of(
@@ -102,17 +99,12 @@ class RayPairs:
             geometry, window, values = _joined_rows(geometry, window, values)
         return cls(ConjugateRays(geometry, window, about), values, parted)
 
-    @cached_property
-    def _places(self) -> Places:
-        """Where the conjugates of all readings lie."""
-        return self.rays.places(self.base)
-
     def _with_conjugates(self, way: int) -> tuple[Tensor, Tensor, Tensor]:
         """Readings and conjugates of the views that lie so many places behind each."""
-        n = self._order.size
-        if self._at.size == n:  # all views: they are looked up already
+        pairs = self._pairs
+        if pairs.all_views:  # they are looked up already
             return tuple(v.roll(-way, 0) for v in (self.here, self.conjugate, self.known))  # type: ignore[return-value]
-        views = self._order[(self._at + way) % n]
+        views = pairs.views_behind(way)
         return self._values[torch.from_numpy(views)], *self.rays.conjugate(self._values, views)
 
     def shifted(self) -> Pattern:
@@ -134,43 +126,23 @@ class RayPairs:
             if not self.rays.geometry.has_rows or self.rays.window.rows < 3:
                 return None
             return 2.0 * self.heights()[:, None], "columns"
-        gamma = self.rays.fan_angles(self.base)
         if name == "scale":
-            if self.rays.parallel:
-                return None
-            factor = 2.0 * gamma
-        else:
-            turned = unwrapped(self.rays.geometry.angles)
-            factor = (
-                sum(end.part * turned[end.views] for end in self._places.ends)
-                - turned[self.base][:, None]
-            )
-        return torch.from_numpy(factor)[:, None].float(), "angles"
-
-    def whole(self, columns: int) -> Tensor:
-        """A slope reaches over neighbours: all of them must have a conjugate."""
-        if columns not in self._whole:
-            width = self.known.shape[-1]
-            missing = F.pad((~self.known).cumsum(-1, dtype=torch.int32), (1, 0))
-            at = torch.arange(width)
-            first, end = (at - columns).clamp_min(0), (at + columns + 1).clamp_max(width)
-            self._whole[columns] = missing[..., end] == missing[..., first]
-        return self._whole[columns]
+            return None if self.rays.parallel else (self._pairs.twice_fan_angles, "angles")
+        return self._pairs.turned_between, "angles"
 
     def used(self, columns: int) -> NDArray[np.int64]:
         """Views in which a slope is known."""
-        if columns not in self._used:
-            self._used[columns] = np.flatnonzero(self.whole(columns).flatten(1).any(1).numpy())
-        return self._used[columns]
+        return self._pairs.used(columns)
 
     def slopes(self, along: str, columns: int) -> tuple[Any, ...]:
         """Smoothed slopes of both rays, raw ones of both, and where they are known."""
         if (along, columns) not in self._slopes:
-            sizes, known = ((_ROWS, columns), (1, columns // 5)), self.whole(columns)
+            sizes, known = ((_ROWS, columns), (1, columns // 5)), self._pairs.whole(columns)
             if along == "columns":
                 pairs = _filtered((self.here, self.conjugate), _difference, sizes)
             else:
-                (before, behind), step, rate = self.beside
+                before, behind = self.beside
+                step, rate = self._pairs.step, self._pairs.rate
                 changes = (behind[0] - before[0], behind[1] - before[1])
                 pairs = [[v / step for v in both] for both in _filtered(changes, _mean, sizes)]
                 if bool((rate != 0.0).any()):  # of a window that moves with the views
@@ -183,20 +155,11 @@ class RayPairs:
         return self._slopes[along, columns]
 
     @cached_property
-    def beside(self) -> Any:
-        """The views before and behind, the angle between them, and the columns that a window
-        moves per rad."""
-        n, turn = self._order.size, self.rays.geometry.angles % (2 * math.pi)
-        ends = [self._order[(self._at + k) % n] for k in (-1, 1)]
-        step = (turn[ends[1]] - turn[ends[0]]) % (2 * math.pi)
-        good = (step > 1e-9) & (step <= 2.0 * _GAP_STEPS * view_step(self.rays.geometry.angles))
-        step = np.where(good, step, 1.0)
-        first = self.rays.window.first_column
-        rate = (first[ends[1]] - first[ends[0]]) / step
+    def beside(self) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """Of the views before and behind each: readings, conjugates, and which of them are known
+        and near enough."""
         looked = [self._with_conjugates(k) for k in (-1, 1)]
-        mask = torch.from_numpy(good)[:, None, None]
-        sides = [(*part[:2], part[2] & mask) for part in looked]
-        return sides, *(torch.from_numpy(v)[:, None, None].float() for v in (step, rate))
+        return [(here, there, known & self._pairs.near) for here, there, known in looked]
 
     def sums(self, pattern: Pattern, columns: int) -> tuple[Floats, Floats, Floats] | None:
         """Score and power of a pattern in every view, and which part of the score interpolation
@@ -209,21 +172,21 @@ class RayPairs:
         power = factor.square() * (smooth[0] * raw[1] + smooth[1] * raw[0]) / 2
         values = (-self.residue * slope, power, -self.curvature * slope)
         score, power, bent = (
-            torch.where(known, v, 0.0).double().sum((1, 2)).numpy() for v in values
+            torch.where(known, v, 0.0).sum((1, 2), dtype=torch.float64).numpy() for v in values
         )
         return score, power, bent
 
     @cached_property
     def between_views(self) -> Tensor:
         """How far readings lie from the mean of those in the views before and behind."""
-        (before, behind), *_ = self.beside
+        before, behind = self.beside
         difference: Tensor = self.here - (before[0] + behind[0]) / 2
         return difference
 
     @cached_property
     def curvature(self) -> Tensor:
         """By how much the conjugate is too low for having been interpolated in straight lines."""
-        return self.rays.curvature(self._values, self._places, self.between_views)
+        return self._pairs.places.curvature(self._values, self.between_views)
 
     @cached_property
     def residue(self) -> Tensor:
@@ -242,7 +205,7 @@ class RayPairs:
         if self.rays.parallel:
             return 0.0
         bend = self.here[..., 2:] - 2.0 * self.here[..., 1:-1] + self.here[..., :-2]
-        beside = self._values[torch.from_numpy(self._order[(self._at + 1) % self._order.size])]
+        beside = self._values[torch.from_numpy(self._pairs.views_behind(1))]
         other = beside[..., 2:] - 2.0 * beside[..., 1:-1] + beside[..., :-2]
         square = float(torch.where(self.known[..., 1:-1], bend * other, 0.0).double().sum())
         reach = float(np.sin(np.abs(self.rays.fan_angles(self.base)).max()))
@@ -353,6 +316,7 @@ def _joined_rows(geometry: ConeBeam, window: DetectorWindow, values: Tensor) -> 
     return wider, window.with_rows(0, rows), values
 
 
+@lru_cache
 def _difference(columns: int) -> Tensor:
     """Central difference along the columns, averaged over so many (odd)."""
     kernel = torch.zeros(columns + 2)
@@ -400,7 +364,7 @@ class ConjugateRays:
     """Where the conjugate of a reading lies: view, row and column, all fractional."""
 
     def __init__(self, geometry: Any, window: DetectorWindow, about: tuple[float, float]) -> None:
-        self.geometry, self.window = geometry, window
+        self.geometry, self.window, self.about = geometry, window, about
         self.parallel = geometry.parallel
         u = geometry.column_positions
         self.flat = not geometry.has_rows
@@ -436,39 +400,8 @@ class ConjugateRays:
 
         Each pair counts once, with its ray of positive fan angle.
         """
-        return self.interpolated(values, self.places(base))
-
-    def interpolated(self, values: Tensor, places: Places) -> tuple[Tensor, Tensor]:
-        """:meth:`conjugate` of the views whose :meth:`places` are known."""
-        known = places.known
-        total = torch.zeros(known.shape)
-        for end in places.ends:
-            total += end.share * end.of(values)
-            known = known & end.inside
-        return total, known
-
-    def curvature(self, values: Tensor, places: Places, between: Tensor) -> Tensor:
-        """By how much :meth:`conjugate` is too low, to second order, since it is interpolated in
-        straight lines.
-
-        A second difference D from neighbour to neighbour leaves -s (1 - s) D / 2 at the part s of
-        the way.
-
-        Args:
-            values: see :meth:`conjugate`.
-            places: of the conjugates.
-            between: ``(base, rows, columns)``, how far the readings themselves lie from the mean of
-                those in the views before and behind, -D / 2 along the views, which their conjugates
-                share.
-        """
-        bend = F.pad(values[..., 2:] - 2.0 * values[..., 1:-1] + values[..., :-2], (1, 1))
-        total = torch.zeros(places.known.shape)
-        for end in places.ends:
-            way = end.column - np.floor(end.column)
-            part = end.part * -0.5 * way * (1.0 - way)
-            total += torch.from_numpy(part)[:, None].float() * end.of(bend)
-        share = places.ends[1].part
-        return total + torch.from_numpy(share * (1.0 - share))[:, None].float() * between
+        places = self.places(base)
+        return places.of(values), places.known
 
     def places(self, base: NDArray[np.int64]) -> Places:
         """Where the conjugates of the readings of the views ``base`` lie."""
@@ -503,6 +436,7 @@ class ConjugateRays:
             pitch = self.rows[1] - self.rows[0] if self.rows.size > 1 else 1.0
             row = (height - self.rows[0]) / pitch - w.first_row
             found.append(Place(views, part, row, column, w.rows, w.columns))
+            known = known & found[-1].inside
         return Places(found, known)
 
 
@@ -551,7 +485,7 @@ class Place:
         found = [
             torch.lerp(flat[left], flat[left + self._step], self._across) for left in self._places
         ]
-        return found[0] if self._along is None else torch.lerp(*found, self._along)
+        return found[0] if self._along is None else torch.lerp(found[0], found[1], self._along)
 
 
 class Places(NamedTuple):
@@ -560,3 +494,117 @@ class Places(NamedTuple):
 
     ends: list[Place]
     known: Tensor
+
+    def of(self, values: Tensor) -> Tensor:
+        """The conjugates of readings ``(views, rows, columns)``."""
+        total = torch.zeros(self.known.shape)
+        for end in self.ends:
+            total += end.share * end.of(values)
+        return total
+
+    def curvature(self, values: Tensor, between: Tensor) -> Tensor:
+        """By how much :meth:`of` is too low, to second order, since it is interpolated in straight
+        lines.
+
+        A second difference D from neighbour to neighbour leaves -s (1 - s) D / 2 at the part s of
+        the way.
+
+        Args:
+            values: see :meth:`of`.
+            between: ``(base, rows, columns)``, how far the readings themselves lie from the mean of
+                those in the views before and behind, -D / 2 along the views, which their conjugates
+                share.
+        """
+        bend = F.pad(values[..., 2:] - 2.0 * values[..., 1:-1] + values[..., :-2], (1, 1))
+        total = torch.zeros(self.known.shape)
+        for end in self.ends:
+            way = end.column - np.floor(end.column)
+            part = end.part * -0.5 * way * (1.0 - way)
+            total += torch.from_numpy(part)[:, None].float() * end.of(bend)
+        share = self.ends[1].part
+        return total + torch.from_numpy(share * (1.0 - share))[:, None].float() * between
+
+
+class _Pairs:
+    """What the pairs of a geometry share, whatever they read.
+
+    Attributes:
+        base, angles: of the views whose readings are compared, in the order of their angles.
+        all_views: whether these are all.
+        places: of the conjugates.
+        step, rate, near: angle between the view before and the one behind, rad; columns that the
+            window moves between them per rad; whether they are near enough, ``(base, 1, 1)``.
+    """
+
+    def __init__(self, rays: ConjugateRays) -> None:
+        self.rays = rays
+        angles = rays.geometry.angles
+        self._order = np.argsort(angles % (2 * math.pi), kind="stable")
+        stride = max(1, math.ceil(math.prod(rays.window.shape) / _MOST))
+        self._at = np.arange(0, angles.size, stride)
+        self.base, self.all_views = self._order[self._at], stride == 1
+        self.angles = angles[self.base]
+        self.places = rays.places(self.base)
+        before, behind = self.views_behind(-1), self.views_behind(1)
+        turn = angles % (2 * math.pi)
+        step = (turn[behind] - turn[before]) % (2 * math.pi)
+        good = (step > 1e-9) & (step <= 2.0 * _GAP_STEPS * view_step(angles))
+        step = np.where(good, step, 1.0)
+        first = rays.window.first_column
+        rate = (first[behind] - first[before]) / step
+        self.near = torch.from_numpy(good)[:, None, None]
+        self.step, self.rate = (torch.from_numpy(v)[:, None, None].float() for v in (step, rate))
+        self._whole: dict[int, Tensor] = {}
+        self._used: dict[int, NDArray[np.int64]] = {}
+
+    @property
+    def known(self) -> Tensor:
+        """Which rays have a pair, ``(base, rows, columns)``."""
+        return self.places.known
+
+    def views_behind(self, way: int) -> NDArray[np.int64]:
+        """The views so many places behind those of ``base``."""
+        return self._order[(self._at + way) % self._order.size]
+
+    def whole(self, columns: int) -> Tensor:
+        """A slope reaches over neighbours: all of them must have a conjugate."""
+        if columns not in self._whole:
+            width = self.known.shape[-1]
+            missing = F.pad((~self.known).cumsum(-1, dtype=torch.int32), (1, 0))
+            at = torch.arange(width)
+            first, end = (at - columns).clamp_min(0), (at + columns + 1).clamp_max(width)
+            self._whole[columns] = missing[..., end] == missing[..., first]
+        return self._whole[columns]
+
+    def used(self, columns: int) -> NDArray[np.int64]:
+        """Views in which a slope is known."""
+        if columns not in self._used:
+            self._used[columns] = np.flatnonzero(self.whole(columns).flatten(1).any(1).numpy())
+        return self._used[columns]
+
+    @cached_property
+    def twice_fan_angles(self) -> Tensor:
+        """What a conjugate's view moves by if fan angles grow, ``(base, 1, columns)``."""
+        return torch.from_numpy(2.0 * self.rays.fan_angles(self.base))[:, None].float()
+
+    @cached_property
+    def turned_between(self) -> Tensor:
+        """What it moves by if steps between views grow: the way from a reading's view to its
+        conjugate's, ``(base, 1, columns)`` rad."""
+        turned = unwrapped(self.rays.geometry.angles)
+        way = sum(end.part * turned[end.views] for end in self.places.ends)
+        return torch.from_numpy(way - turned[self.base][:, None])[:, None].float()
+
+
+def _pairs_of(geometry: Any, window: DetectorWindow, about: tuple[float, float]) -> _Pairs:
+    """Of small scans kept for the next one of the same geometry: there, looking for them costs as
+    much as all else."""
+    few = math.prod(window.shape) <= _SMALL
+    return _kept_pairs(geometry, window, about) if few else _new_pairs(geometry, window, about)
+
+
+def _new_pairs(geometry: Any, window: DetectorWindow, about: tuple[float, float]) -> _Pairs:
+    return _Pairs(ConjugateRays(geometry, window, about))
+
+
+_kept_pairs = lru_cache(maxsize=2)(_new_pairs)

@@ -341,6 +341,7 @@ def _transfer(
     known = np.isfinite(second)
     second, mean = second[known], mean[known]
     at = np.clip(np.searchsorted(edges, mean, side="right") - 1, 0, len(edges) - 2)
+    at = at.astype(np.int8)  # so short that its order is counted
     order = np.argsort(at, kind="stable")
     parts = np.split(order, np.searchsorted(at[order], np.arange(1, len(edges) - 1)))
     # Over √m, so that the dimmer ones of a class do not count for more.
