@@ -318,7 +318,10 @@ class _Views:
         ]
         left = [c[2:-2] - f for c, f in zip(change, foretold, strict=True)]
         turning = [(r[3:-1] - r[1:-3]) * a[2:-2, None] for r in rate]
-        kink = (turning[0] * turning[1]).sum(1)
+        # Few columns sample a sharp edge differently: one set may turn about, the other not.
+        kink = np.maximum((turning[0] * turning[1]).sum(1), 0.0)
+        aliased = 0.5 * np.square(turning[0] - turning[1]).sum(1)
+        kink += 0.5 * np.maximum(aliased - _beside(aliased, self.closes), 0.0)
         steady = np.all([a[k : k + pairs] < _STEADY * self.step for k in range(5)], axis=0)
         square, usual = ((x[0] * x[1]).sum(1) for x in (left, foretold))
         near = np.maximum(_beside(square, self.closes), 0.0)
