@@ -334,6 +334,24 @@ def test_a_rod_of_titanium_is_metal_whatever_the_noise():
         assert "metal" in text
 
 
+def test_what_rings_is_no_metal_and_hides_none():
+    """An iteration that has not ended rings where few views look: 14 000 HU beside −13 000."""
+    x = torch.arange(24.0)
+    ringing = _noise(20.0)
+    ringing[0, :, 18:] -= 14_000.0 * torch.cos(torch.pi * x[18:]) * torch.exp((x[18:] - 23.0) / 4)
+    assert float(ringing.max()) > 12_000.0
+    assert metal_warnings(ringing) == []
+    ringing[5, 4:7, 4:7] += 8_000.0  # a screw
+    (text,) = metal_warnings(ringing)
+    assert 8_000 <= int(text.split("reaches ")[1].split(" HU")[0]) < 8_100
+    # Edges undershoot, streaks are dark.
+    screw = _noise(20.0)[5] - 1000.0
+    screw[10:13, 10:13] += 9_000.0
+    screw[9:14, [9, 13]] -= 1_800.0
+    screw[11, 13:] -= 1_500.0
+    assert len(metal_warnings(screw)) == len(metal_warnings(screw.flatten())) == 1
+
+
 def test_fbp_names_metal_in_hu_and_knows_nothing_of_it_in_other_units():
     columns = (np.arange(64) - 31.5) * 0.5
     geometry = ParallelBeam(np.arange(90) * np.pi / 90, 64, 0.5)
