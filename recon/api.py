@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar, Unpack, overload
 
 import torch
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from recon.mbir.mbir import Mbir
     from recon.mbir.priors import Prior
     from recon.vessel.prior import VesselPrior
+    from torchpcct.typing import JsonObject
 
 __all__ = ["MethodOptions", "reconstruct"]
 
@@ -242,7 +243,7 @@ def reconstruct(
     return volumes[0] if isinstance(scan, Scan) else volumes
 
 
-def _device(scans: Sequence[Scan], device: Any) -> torch.device:
+def _device(scans: Sequence[Scan], device: str | int | torch.device | None) -> torch.device:
     """Where to compute: on the device that is named, else where the scans lie."""
     if device is not None:
         return device_of(device)
@@ -275,7 +276,7 @@ def _within_memory(batches: Iterator[T], device: torch.device) -> Iterator[T]:
         ) from error
 
 
-def _on_cpu(method: str, scan: Scan, report: Mapping[str, Any]) -> list[str]:
+def _on_cpu(method: str, scan: Scan, report: JsonObject) -> list[str]:
     """What was computed on the CPU although the rest was not."""
     found = ["tests and repair of the readings"]
     if method != "fbp":
@@ -306,7 +307,7 @@ def _consistency(scan: Scan, grid: VolumeGrid) -> list[str]:
 
 def _finished(
     scan: Scan, grid: VolumeGrid, solution: Result
-) -> tuple[Tensor, dict[str, Any], list[str]]:
+) -> tuple[Tensor, JsonObject, list[str]]:
     """The volume in the scan's unit, the report with what the tests of the data say, and all
     warnings."""
     values, report, tests = solution.volume.to(torch.float32), dict(solution.report), solution.tests

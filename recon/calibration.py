@@ -23,7 +23,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -38,6 +38,10 @@ from torchpcct.projector.posed import PosedEngine
 from torchpcct.projector.poses import with_parameters
 from torchpcct.scan import Scan
 from torchpcct.validate import checked, choice
+
+if TYPE_CHECKING:
+    from torchpcct.projector.poses import ParametricGeometry
+    from torchpcct.typing import JsonObject
 
 __all__ = ["FREE", "Calibration", "calibrate"]
 
@@ -111,7 +115,7 @@ class Calibration:
             for name, value in self.values.items()
         )
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> JsonObject:
         """All numbers, for JSON."""
         return {
             "values": self.values,
@@ -321,7 +325,7 @@ class _Problem:
             for n, v in zip(self.names, values, strict=True)
         ]
 
-    def scan_of(self, values: Floats) -> Any:
+    def scan_of(self, values: Floats) -> ParametricGeometry:
         return with_parameters(
             self.base,
             **{

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from torch import Tensor
 
 if TYPE_CHECKING:
     from torchpcct.metrics.residual_test import ResidualTest  # loads scipy.stats
+    from torchpcct.typing import JsonObject
 
 __all__ = ["Result"]
 
@@ -33,7 +34,7 @@ class Result(NamedTuple):
     """
 
     volume: Tensor
-    report: dict[str, Any]
+    report: JsonObject
     warnings: Sequence[str] = ()
     tests: Sequence[ResidualTest] = ()
 

@@ -65,10 +65,9 @@ from torchpcct.validate import checked, choice, memory_bytes
 from torchpcct.volume import from_hu, to_hu
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from concurrent.futures import Executor
 
-    from torchpcct.typing import Array
+    from torchpcct.typing import Array, JsonObject
 
 
 __all__ = ["ScanSlices", "SlabPlan", "StackOptions", "plan_slabs", "reconstruct_to"]
@@ -138,7 +137,7 @@ class ScanSlices:
             geometry view by view; CatSim's and DICOM-CT-PD files).
     """
 
-    window = None
+    window = region = None
 
     def __init__(self, scan: Scan | str | os.PathLike[str], **options: Any) -> None:
         takes = {"slices"} if isinstance(scan, Scan) else own_options(scan)
@@ -185,8 +184,8 @@ class ScanSlices:
     def seen_grid(
         self,
         voxel: float | None = None,
-        extent: float | Sequence[float] | None = None,
-        center: float | Sequence[float] | None = None,
+        extent: object = None,
+        center: object = None,
     ) -> VolumeGrid:
         """What :meth:`torchpcct.VolumeGrid.of` gives."""
         return grid_of(self, voxel, extent, center)
@@ -486,7 +485,7 @@ def reconstruct_to(
     reader: Mapping[str, Any] | None = None,
     progress: Callable[[float], None] | None = None,
     **options: Unpack[StackOptions],
-) -> dict[str, Any]:
+) -> JsonObject:
     """Reconstruct a volume slab by slab into a file, within a limit of memory.
 
     The same as :func:`recon.reconstruct` and :meth:`torchpcct.volume.Volume.save`, to the bit on
@@ -556,7 +555,7 @@ def reconstruct_to(
             file.discard()
             raise
     notes = file.notes
-    sides: Any = tuple(notes["sides"])
+    sides: tuple[bool, bool] = tuple(notes["sides"])
     begun = file.done
     if begun or any(sides):
         plan = plan_slabs(g, grid, memory, method, sides=sides, done=begun, parts=parts)
@@ -712,7 +711,7 @@ def _slices_of(grid: VolumeGrid, first: int, stop: int) -> VolumeGrid:
     return VolumeGrid((stop - first, *grid.shape[1:]), grid.spacing, (z, *grid.center[1:]))
 
 
-def _survey(source: ScanSlices, plan: SlabPlan) -> dict[str, Any]:
+def _survey(source: ScanSlices, plan: SlabPlan) -> JsonObject:
     """What has to be known of all readings before the first slab, and what the middle ones say
     of the scan."""
     g, cone = source.geometry, source.geometry.has_rows
@@ -741,7 +740,7 @@ def _survey(source: ScanSlices, plan: SlabPlan) -> dict[str, Any]:
 
 def _test_middle(
     source: ScanSlices, plan: SlabPlan, replaced: int, sides: tuple[bool, bool]
-) -> dict[str, Any]:
+) -> JsonObject:
     g, cone = source.geometry, source.geometry.has_rows
     most = min(_LOOKED_AT, max(high - low for low, high in plan.bands), source.count)
     if cone:  # about the plane of the orbit

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.validate import checked
+
+if TYPE_CHECKING:
+    from torchpcct.geometry import Geometry
 
 Floats = NDArray[np.float64]
 
@@ -75,7 +78,7 @@ def view_steps(
 
 
 @checked
-def is_offset(geometry: Any) -> bool:
+def is_offset(geometry: Geometry) -> bool:
     """Whether the detector reaches farther to one side by more than ``OFFSET_SHARE`` of its width
     and two columns.
 

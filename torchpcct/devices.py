@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,7 +10,7 @@ from torch import Tensor
 from torchpcct.memory import free_bytes
 
 
-def device_of(device: Any) -> torch.device:
+def device_of(device: object) -> torch.device:
     """The device that is meant, with its number (``"cuda"`` is the current one).
 
     Raises:

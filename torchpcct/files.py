@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from types import FrameType
 
     import h5py
+    from _typeshed import ReadableBuffer
 
 
 __all__ = ["WriteError"]
@@ -238,7 +239,7 @@ class _Unfailing(io.FileIO):
 
     failure: BaseException | None = None
 
-    def write(self, data: Any, /) -> int:
+    def write(self, data: ReadableBuffer, /) -> int:
         rest = memoryview(data).cast("B")
         size = len(rest)
         try:

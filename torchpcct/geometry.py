@@ -19,7 +19,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,13 @@ from torchpcct.validate import checked, choice, number, per_axis, whole
 
 if TYPE_CHECKING:
     from torchpcct.typing import Views
+
+    class _HasGrid(Protocol):
+        """A scan that knows the grid of what it sees."""
+
+        def seen_grid(self, voxel: float | None, extent: object, center: object) -> VolumeGrid:
+            """See :meth:`VolumeGrid.of`."""
+            ...
 
 
 __all__ = ["Beam", "ConeBeam", "FanBeam", "Geometry", "ParallelBeam", "VolumeGrid", "full_turn"]
@@ -95,10 +102,10 @@ def _axis(count: int, pitch: float, offset: float) -> Floats:
     return (np.arange(count, dtype=np.float64) - (count - 1) / 2.0) * pitch + offset
 
 
-def _short(name: str, value: Any) -> str:
+def _short(name: str, value: object) -> str:
     """A value in one line: of many angles the first and the last in degrees, of other arrays the
     shape."""
-    if name == "angles":
+    if name == "angles" and isinstance(value, np.ndarray):
         ends = f"{math.degrees(value[0]):.5g}°" + (
             f" … {math.degrees(value[-1]):.5g}°" if value.size > 1 else ""
         )
@@ -163,6 +170,11 @@ class Geometry:
     def row_offset(self) -> float:
         """Position of the detector's centre along the rows, mm; 0 without rows."""
         return 0.0
+
+    @property
+    def column_positions(self) -> Floats:
+        """Column centres along the detector, ``(columns,)`` mm; of a curved one along the arc."""
+        return _axis(self.columns, self.column_pitch, self.column_offset)
 
     @property
     def row_positions(self) -> Floats:
@@ -250,7 +262,7 @@ class ParallelBeam(Geometry):
         TypeError: a value of the wrong kind.
     """
 
-    angles: Any
+    angles: Floats
     columns: int
     pitch: float
     offset: float = 0.0
@@ -273,11 +285,6 @@ class ParallelBeam(Geometry):
     @property
     def column_offset(self) -> float:
         return self.offset
-
-    @property
-    def column_positions(self) -> Floats:
-        """Cell centres along ``e_t``, ``(columns,)`` mm."""
-        return _axis(self.columns, self.pitch, self.offset)
 
     @property
     def ray_distances(self) -> Floats:
@@ -328,12 +335,6 @@ class _Divergent(Geometry):
         return self.sdd / self.sod
 
     @property
-    def column_positions(self) -> Floats:
-        """Cell centres along the detector (flat: along ``e_t``; curved: along the arc),
-        ``(columns,)`` mm."""
-        return _axis(self.columns, self.column_pitch, self.column_offset)
-
-    @property
     def ray_distances(self) -> Floats:
         """Distance from the axis of the ray to every column centre, signed, ``(columns,)`` mm."""
         return self.sod * np.sin(self.fan_angles)
@@ -378,7 +379,7 @@ class FanBeam(_Divergent):
         TypeError: a value of the wrong kind.
     """
 
-    angles: Any
+    angles: Floats
     sod: float
     sdd: float
     columns: int
@@ -421,7 +422,7 @@ class ConeBeam(_Divergent):
         TypeError: a value of the wrong kind.
     """
 
-    angles: Any
+    angles: Floats
     sod: float
     sdd: float
     columns: int
@@ -554,7 +555,12 @@ class VolumeGrid:
     @classmethod
     @checked
     def of(
-        cls, scan: Any, *, voxel: float | None = None, extent: object = None, center: object = None
+        cls,
+        scan: _HasGrid,
+        *,
+        voxel: float | None = None,
+        extent: object = None,
+        center: object = None,
     ) -> VolumeGrid:
         """The grid of what a scan sees.
 
@@ -576,8 +582,7 @@ class VolumeGrid:
             ValueError: values out of range, another number of axes, a part of a detector that sees
                 no box in all views.
         """
-        found: VolumeGrid = scan.seen_grid(voxel, extent, center)
-        return found
+        return scan.seen_grid(voxel, extent, center)
 
     @property
     def axes(self) -> tuple[Floats, ...]:

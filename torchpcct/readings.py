@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 import torch
@@ -22,6 +22,10 @@ from torchpcct.geometry import Geometry
 from torchpcct.scan_grid import cells_at_axis
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.validate import number
+
+if TYPE_CHECKING:
+    from torchpcct.detector_window import DetectorWindow
+    from torchpcct.geometry import VolumeGrid
 
 __all__ = ["dispersion", "interpolate_dead", "inverse_variance", "log_bias"]
 
@@ -49,6 +53,39 @@ DIM = 20.0
 """Photons of a reading below which its noise is far from normal."""
 TRANSFER_FRAMES = 4
 """Air frames that a photon transfer needs at least."""
+
+
+class ReadingFields(TypedDict):
+    """Fields of :class:`torchpcct.scan.Scan` that have a value for each reading."""
+
+    counts: Tensor
+    quantum: Tensor | None
+    dead: Tensor | None
+
+
+class ScanFields(TypedDict, total=False):
+    """Fields of :class:`torchpcct.scan.Scan`, which describes them; a source of scans fills those
+    that it knows."""
+
+    counts: Tensor
+    air: Tensor
+    geometry: Geometry
+    linearisation: WaterLinearisation
+    exposure_s: float | None
+    seed: int | None
+    window: DetectorWindow | None
+    surround: Tensor | None
+    counting: bool
+    info: dict[str, object]
+    quantum: Tensor | None
+    electronic_noise: float
+    flux: Tensor | None
+    dead: Tensor | None
+    logged: bool
+    unit: str
+    region: VolumeGrid | None
+
+
 _TRANSFER_SIGMAS = 3.0
 """Standard errors by which a photon transfer must differ from 1: less, and readings are counts."""
 MEDIAN_TO_SD = 1.4826
@@ -232,7 +269,7 @@ def counted(
     electronic_noise: float | None,
     linearisation: object,
     mu_water: float | None,
-) -> dict[str, Any]:
+) -> ScanFields:
     """Fields of a scan from raw readings; see ``Scan.from_counts``."""
     raw = _tensor("readings", readings)
     cells = _shapes("readings", raw, geometry)
@@ -259,7 +296,7 @@ def counted(
         )
     correction, unit = _correction(linearisation, geometry, mu_water)
     integrating = offset or electronic_noise > 0
-    fields: dict[str, Any] = {
+    fields: ScanFields = {
         "counts": counts,
         "air": bright,
         "linearisation": correction,
@@ -299,7 +336,7 @@ def logged(
     dead: object,
     linearisation: object,
     mu_water: float | None,
-) -> dict[str, Any]:
+) -> ScanFields:
     """Fields of a scan from line integrals; see ``Scan.from_line_integrals``."""
     p = _tensor("lines", lines)
     cells = _shapes("lines", p, geometry)

@@ -33,6 +33,7 @@ from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.validate import UNITS, checked, choice, number, whole
 
 if TYPE_CHECKING:
+    from torchpcct.readings import ReadingFields
     from torchpcct.scanner.scanner import Scanner
     from torchpcct.typing import Ints, Views
 
@@ -175,7 +176,8 @@ class Scan:
             mu_water,
         )
         fields["info"] |= dict(info or {})
-        return cls(geometry=geometry, exposure_s=exposure_s, **fields)
+        fields |= {"geometry": geometry, "exposure_s": exposure_s}
+        return cls(**fields)
 
     @classmethod
     @checked
@@ -207,7 +209,8 @@ class Scan:
         """
         fields = logged(lines, geometry, photons, dead, linearisation, mu_water)
         fields["info"] |= dict(info or {})
-        return cls(geometry=geometry, exposure_s=exposure_s, **fields)
+        fields |= {"geometry": geometry, "exposure_s": exposure_s}
+        return cls(**fields)
 
     def __repr__(self) -> str:
         what = "line integrals" if self.logged else "counts" if self.counting else "readings"
@@ -407,11 +410,14 @@ class Scan:
             **self.each(lambda readings: outer.crop(readings, window)),
         )
 
-    def each(self, change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
+    def each(self, change: Callable[[Tensor], Tensor]) -> ReadingFields:
         """What has a value for each reading (``counts``, ``quantum``, ``dead``), changed alike;
         None stays."""
-        held = {name: getattr(self, name) for name in ("counts", "quantum", "dead")}
-        return {name: None if values is None else change(values) for name, values in held.items()}
+        return {
+            "counts": change(self.counts),
+            "quantum": None if self.quantum is None else change(self.quantum),
+            "dead": None if self.dead is None else change(self.dead),
+        }
 
     def seen_grid(
         self, voxel: float | None = None, extent: object = None, center: object = None
@@ -606,13 +612,13 @@ class Scan:
         """Mean over the views of readings ``(views, r, c)`` on the window, ``(rows, columns)``."""
         w, g = self.window, self.geometry
         assert w is not None
-        double: Any = {"dtype": torch.float64, "device": readings.device}
-        total, read = torch.zeros((w.rows, g.columns), **double), torch.zeros(g.columns, **double)
+        total = readings.new_zeros((w.rows, g.columns), dtype=torch.float64)
+        read = readings.new_zeros(g.columns, dtype=torch.float64)
         columns = torch.from_numpy(w.column_indices).to(readings.device)
         for values, at in zip(readings, columns, strict=True):
             total.index_add_(-1, at, values.double())
-            read.index_add_(0, at, torch.ones(len(at), **double))
-        out = torch.full((g.rows, g.columns), float(readings.double().mean()), **double)
+            read.index_add_(0, at, read.new_ones(len(at)))
+        out = read.new_full((g.rows, g.columns), float(readings.double().mean()))
         rows = slice(w.first_row, w.first_row + w.rows)
         out[rows] = torch.where(read > 0, total / read.clamp(min=1.0), out[rows])
         return out.to(readings.dtype)

@@ -16,6 +16,9 @@ from torchpcct.vector_geometry import VectorGeometry
 
 if TYPE_CHECKING:
     import h5py
+    from torch import Tensor
+
+    from torchpcct.readings import ScanFields
 
 
 G = TypeVar("G", bound=Geometry)
@@ -87,7 +90,7 @@ def write_scan(scan: Any, path: str | os.PathLike[str]) -> None:
 
 def scan_fields(
     file: h5py.File, path: str | os.PathLike[str], slices: slice | None = None
-) -> dict[str, Any]:
+) -> ScanFields:
     """Fields of the scan in an open HDF5 file; with ``slices`` those of some slices, or rows of a
     cone beam.
 
@@ -131,16 +134,14 @@ def scan_fields(
             raise type(error)(f"{path}: {error}") from error
         slices = slice(*info["slices"][:2])
 
-    def given(name: str, axis: int = axis) -> Any:
-        if name not in file:
-            return None
+    def held(name: str, axis: int = axis) -> Tensor:
         return torch.from_numpy(
             file[name][()] if slices is None else file[name][(slice(None),) * axis + (slices,)]
         )
 
     return {
-        "counts": given("counts").to(torch.float32),
-        "air": given("air", 0),
+        "counts": held("counts").to(torch.float32),
+        "air": held("air", 0),
         "geometry": geometry,
         "linearisation": WaterLinearisation.load(file["linearisation"]),
         "exposure_s": float(file.attrs["exposure_s"]) if "exposure_s" in file.attrs else None,
@@ -149,10 +150,10 @@ def scan_fields(
         "surround": surround,
         "counting": bool(file.attrs["counting"]),
         "info": info,
-        "quantum": given("quantum_kev"),
+        "quantum": held("quantum_kev") if "quantum_kev" in file else None,
         "electronic_noise": float(file.attrs.get("electronic_noise_kev", 0.0)),
         "flux": torch.from_numpy(file["flux"][()]) if "flux" in file else None,
-        "dead": given("dead"),
+        "dead": held("dead") if "dead" in file else None,
         "logged": bool(file.attrs.get("logged", False)),
         "unit": str(file.attrs.get("unit", "HU")),
         "region": region,

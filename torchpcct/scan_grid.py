@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,8 @@ from torchpcct.vector_geometry import VectorGeometry
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from torch import Tensor
+
 
 Floats = NDArray[np.float64]
 
@@ -30,14 +32,30 @@ _SHARES = 40
 """Sizes that are tried, the largest first."""
 
 
+class _Seen(Protocol):
+    """What is asked of a :class:`torchpcct.Scan`, or of the slices of its file."""
+
+    @property
+    def geometry(self) -> Any: ...
+
+    @property
+    def window(self) -> DetectorWindow | None: ...
+
+    @property
+    def region(self) -> VolumeGrid | None: ...
+
+    @property
+    def counts(self) -> Tensor: ...
+
+
 def grid_of(
-    scan: Any, voxel: object = None, extent: object = None, center: object = None
+    scan: _Seen, voxel: object = None, extent: object = None, center: object = None
 ) -> VolumeGrid:
     """See :meth:`torchpcct.VolumeGrid.of`, whose arguments these are."""
     voxel = None if voxel is None else number("voxel", voxel, positive=True, unit="mm")
     extent, center = _of_axes(scan, extent, center)
     if scan.window is not None:
-        return _of_region(scan, voxel, extent, center)
+        return _of_region(scan, scan.window, voxel, extent, center)
     g = scan.geometry
     cell, radius = _field_of_view(g)
     voxel = voxel or cell
@@ -69,7 +87,7 @@ def _voxels(extent: Sequence[float], voxel: float | Sequence[float]) -> tuple[in
 
 
 def _of_axes(
-    scan: Any, extent: object, center: object
+    scan: _Seen, extent: object, center: object
 ) -> tuple[list[float] | None, Sequence[float | None] | None]:
     """Extent and centre as z, y, x, where they are given; of slices the extent along z is 0.
 
@@ -124,17 +142,18 @@ def finite_cells(geometry: Geometry) -> list[float]:
 
 
 def _of_region(
-    scan: Any,
+    scan: _Seen,
+    window: DetectorWindow,
     voxel: float | None,
     extent: Sequence[float] | None,
-    center: Any,
+    center: Sequence[float | None] | None,
 ) -> VolumeGrid:
     """The region; with another voxel size or extent, or from one voxel (an extent alone), a grid
     about it."""
     region = scan.region
     if region is None:
         voxel = voxel or scan.geometry.cell
-        region = _seen_by(scan.geometry, scan.window, voxel)
+        region = _seen_by(scan.geometry, window, voxel)
     elif region.voxels == 1:
         voxel = voxel or scan.geometry.cell
     if voxel is None and extent is None and center is None:

@@ -6,7 +6,7 @@ Arrays are those of numpy. ``Json`` is what a JSON or YAML file holds.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias, TypedDict
+from typing import Any, TypeAlias, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,10 @@ Reals: TypeAlias = NDArray[np.float32 | np.float64]
 """Readings, images and volumes: computed in the precision in which they come."""
 
 Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
+
+JsonObject: TypeAlias = dict[str, Any]
+"""A JSON object whose values are read by their keys: the data of a study, a report. What stands
+under which key is described where it is made."""
 
 Views: TypeAlias = slice | Sequence[int] | NDArray[np.integer] | NDArray[np.bool_]
 """Which views: an index array, a mask or a slice."""

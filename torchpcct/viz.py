@@ -10,11 +10,12 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from numpy.typing import ArrayLike
     from torch import Tensor
 
@@ -51,7 +52,7 @@ def panels(
     row_labels: Sequence[str] = (),
     title: str = "",
     footer: str = "",
-) -> Any:
+) -> Figure:
     """A matplotlib figure of panels with one grey scale (C150 / W600 HU) and a scale bar.
 
     Returns:

@@ -6,13 +6,16 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
 from recon.mbir.weights_io import TensorFileError, read_tensors, write_tensors
 from torchpcct.files import LEFTOVER
+
+if TYPE_CHECKING:
+    from torchpcct.typing import JsonObject
 
 CHECKPOINT_FORMAT = "torchpcct training checkpoint 2"
 """What a checkpoint says of itself."""
@@ -42,7 +45,7 @@ class CheckpointStore:
             os.replace(self.current, self.previous)
         os.replace(fresh, self.current)
 
-    def load(self) -> tuple[dict[str, Tensor], dict[str, Any], str | None]:
+    def load(self) -> tuple[dict[str, Tensor], JsonObject, str | None]:
         """Tensors and metadata of the newest whole checkpoint, and a warning if that is not the
         current one.
 

@@ -26,7 +26,7 @@ from train.scenes.scene import SceneConfig
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-    from torchpcct.typing import Json
+    from torchpcct.typing import Json, JsonObject
 
 
 __all__ = ["DataConfig", "ObjectiveConfig", "TrainConfig", "load_config"]
@@ -63,7 +63,7 @@ def _section(cls: type[C], values: object, where: str) -> C:
         raise ValueError(f"{where}: {error}" if where else str(error)) from error
 
 
-def _network(given: Any) -> dict[str, Any]:
+def _network(given: Any) -> JsonObject:
     """Checked arguments of a network, as a mapping."""
     values = {"class": given} if isinstance(given, str) else given
     if not isinstance(values, Mapping) or "class" not in values:
@@ -143,7 +143,7 @@ class DataConfig:
     exposure_s: tuple[float, float] = (0.2, 8.0)
     views: int = 984
     situations: tuple[Situation, ...] = _SITUATIONS
-    scenes: dict[str, Any] = field(default_factory=dict)
+    scenes: JsonObject = field(default_factory=dict)
     scenes_kept: int = 4000
     core_roi: tuple[float, float] = (0.25, 0.8)
     tissue_roi: tuple[float, float] = (0.15, 0.45)
@@ -189,7 +189,7 @@ class LateConfig:
     """
 
     begins: float = 1.0
-    scenes: dict[str, Any] = field(default_factory=dict)
+    scenes: JsonObject = field(default_factory=dict)
     scenes_kept: int = 2000
 
     def __post_init__(self) -> None:
@@ -308,7 +308,7 @@ class TrainConfig:
     checkpoint_seconds: float = 60.0
     validate_every: int = 250
     log_every: int = 1
-    network: dict[str, Any] = field(default_factory=dict)
+    network: JsonObject = field(default_factory=dict)
     unroll: int = 2
     single: float = 0.5
     bfloat16: bool = True

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import safetensors
 import torch
@@ -36,6 +36,9 @@ from train.data import Data, seed_of
 from train.logs import Logs
 from train.objective import Objective
 from train.processes import Group
+
+if TYPE_CHECKING:
+    from torchpcct.typing import JsonObject
 
 __all__ = ["Run"]
 
@@ -71,9 +74,9 @@ class State:
     skipped: int = 0
     bad: int = 0
     seconds: float = 0.0
-    best: dict[str, Any] | None = None
-    sessions: list[dict[str, Any]] = field(default_factory=list)
-    machine: dict[str, Any] = field(default_factory=dict)
+    best: JsonObject | None = None
+    sessions: list[JsonObject] = field(default_factory=list)
+    machine: JsonObject = field(default_factory=dict)
 
 
 def rate_factor(config: TrainConfig, update: int) -> float:
@@ -346,7 +349,7 @@ def finite(value: object) -> object:
 
 
 def export(
-    folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, state: Mapping[str, Any]
+    folder: Path, weights: Mapping[str, Tensor], config: TrainConfig, state: JsonObject
 ) -> None:
     """Write ``weights.safetensors`` (the package's network in float16), ``card.json`` and the same
     as ``training.md``.

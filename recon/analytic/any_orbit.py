@@ -11,7 +11,7 @@ that climbs (a helix) is refused.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -225,13 +225,13 @@ def _parallel(poses: Floats, rows: int, columns: int, cone: bool) -> IdealCircle
     pitch = float(np.median(np.linalg.norm(a, axis=1)))
     count, offset = _axis_of(float(corner[..., 0].min()), float(corner[..., 0].max()), pitch)
     geometry = ParallelBeam(beta, count, pitch, offset)
-    heights: Any = np.zeros(1)
+    heights: NDArray[np.float64] = np.zeros(1)
     if cone:
         row_pitch = float(np.median(np.linalg.norm(b, axis=1)))
         number, middle = _axis_of(
             float(corner[..., 1].min()), float(corner[..., 1].max()), row_pitch
         )
-        heights = (np.arange(number) - (number - 1) / 2) * row_pitch + middle
+        heights = (np.arange(number, dtype=np.float64) - (number - 1) / 2) * row_pitch + middle
     inverse = np.linalg.inv(matrix)
     maps = np.zeros((len(poses), 3, 3))
     maps[:, :2, :2], maps[:, :2, 2], maps[:, 2, 2] = (
@@ -248,8 +248,7 @@ def _resampled(sinogram: Tensor, circle: IdealCircle) -> Tensor:
     Cubic interpolation; beyond the edges the outermost reading is repeated.
     """
     rows, columns = sinogram.shape[-2:]
-    positions: Any = circle.geometry
-    u, v = positions.column_positions, circle.rows
+    u, v = circle.geometry.column_positions, circle.rows
     place = np.stack([np.tile(u, v.size), np.repeat(v, u.size), np.ones(u.size * v.size)])
     middle = np.array([[(columns - 1) / 2], [(rows - 1) / 2]])
     out = []
@@ -259,7 +258,7 @@ def _resampled(sinogram: Tensor, circle: IdealCircle) -> Tensor:
         across, low = _weights(at[0], columns)
         along, lower = _weights(at[1], rows)
         flat = sinogram[..., view, :, :]
-        one: Any = 0.0
+        one = flat.new_zeros(())
         for i in range(along.shape[0]):
             for j in range(across.shape[0]):
                 weight = torch.from_numpy(along[i] * across[j]).to(sinogram)

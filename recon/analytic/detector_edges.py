@@ -10,7 +10,7 @@ of a cylinder that fits its last readings in value and slope (Hsieh et al., Med.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -21,6 +21,9 @@ from torchpcct.angles import is_offset
 from torchpcct.geometry import Beam, ConeBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.validate import checked
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 Floats = NDArray[np.float64]
 G = TypeVar("G", bound=Geometry)
@@ -203,10 +206,13 @@ def _cylinder(last: Tensor, near: Floats, far: Floats, mu: float | Floats) -> Te
     fit. It is exact for parallel rays, and for cylinders on the axis of a fan; a fan's rays see
     another t₀ each, a little.
     """
-    number: dict[str, Any] = {"dtype": torch.float64, "device": last.device}
-    double = torch.as_tensor(2.0 * np.asarray(mu), **number)
+
+    def there(values: ArrayLike | Tensor) -> Tensor:
+        return torch.as_tensor(values, dtype=torch.float64, device=last.device)
+
+    double = there(2.0 * np.asarray(mu))
     double = double[:, None] if double.ndim else double
-    t, u = torch.as_tensor(near, **number), torch.as_tensor(far, **number)
+    t, u = there(near), there(far)
     line = (last.double().clamp(min=0) / double) ** 2 + t * t
     centred = t - t.mean()
     slope = (line * centred).sum(-1, keepdim=True) / (centred * centred).sum()

@@ -113,7 +113,7 @@ def _row(darkest: NDArray[np.float64]) -> int | None:
     return int(alike[np.argmax(darkest[alike])]) if alike.size else None
 
 
-def _plateau(p: Tensor, geometry: Any, mu_water: float, factor: float) -> float | None:
+def _plateau(p: Tensor, geometry: Geometry, mu_water: float, factor: float) -> float | None:
     """Median attenuation, over ``mu_water``, of an object that is all of tissue or plastic if
     ``mu_water`` is ``factor`` times too large; None: it is another one, or a part of a turn is too
     short for an image of it.

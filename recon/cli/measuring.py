@@ -8,7 +8,7 @@ import json
 import shlex
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.parsing import (
@@ -33,8 +33,12 @@ from torchpcct.files import atomic_write, require_writable
 from torchpcct.validate import choice
 
 if TYPE_CHECKING:
-    from recon.study.study import ProgressBars
+    from collections.abc import Sequence
+
+    from recon.evaluate.without_truth import Comparison
+    from recon.study.study import ProgressBars, StudySettings
     from torchpcct.geometry import VolumeGrid
+    from torchpcct.typing import Bools
 
 _STUDY_TASKS = (
     "plaque",
@@ -157,7 +161,9 @@ def _reported(out: Path) -> list[str]:
         return []
 
 
-def _planned_export(tasks: list[str], exposures_s: Any, n: int, folder: Path) -> str:
+def _planned_export(
+    tasks: list[str], exposures_s: Sequence[float] | None, n: int, folder: Path
+) -> str:
     """What ``--export`` would write."""
     from recon.evaluate.tasks import read_task
 
@@ -198,7 +204,7 @@ def _measured(arguments: argparse.Namespace, out: Path) -> None:
     print(f"all figures and the page: {', '.join(map(str, files))}")
 
 
-def _scans(arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], str, str]:
+def _scans(arguments: argparse.Namespace) -> tuple[list[Comparison], str, str]:
     """Rows, unit and name of the reference."""
     from recon.evaluate.methods import names_module
     from recon.evaluate.without_truth import evaluate_scans
@@ -230,7 +236,7 @@ def _scans(arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], str, st
     return found, scans[0].unit, "fbp:ram-lak"
 
 
-def _volumes(arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], str, str]:
+def _volumes(arguments: argparse.Namespace) -> tuple[list[Comparison], str, str]:
     """The same of volumes of two scans of one object that other programs made, one folder a
     scan."""
     from recon.evaluate.methods import same_grid, volume_files
@@ -294,7 +300,7 @@ def _cells(path: Path) -> list[float] | None:
         return None
 
 
-def _region(text: str | None, grid: VolumeGrid) -> Any:
+def _region(text: str | None, grid: VolumeGrid) -> Bools | None:
     """A mask from a volume's file, or from ranges of voxels, ``Z0:Z1,Y0:Y1,X0:X1``."""
     import numpy as np
 
@@ -303,7 +309,7 @@ def _region(text: str | None, grid: VolumeGrid) -> Any:
 
     if text is None:
         return None
-    mask: Any = np.zeros(grid.shape, bool)
+    mask: Bools = np.zeros(grid.shape, bool)
     if not Path(text).exists():
         try:
             parts = [
@@ -351,7 +357,7 @@ def _show_task(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 
 
 def _run_study(
-    name: str, settings: Any, arguments: argparse.Namespace, progress: ProgressBars
+    name: str, settings: StudySettings, arguments: argparse.Namespace, progress: ProgressBars
 ) -> None:
     """Run a study of the registry, save and print its report."""
     folder = arguments.out or Path("out") / name

@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from torchpcct.acquisition.config import SimulationConfig
     from torchpcct.scan import Scan
     from torchpcct.scene.voxels import VoxelScene
+    from torchpcct.typing import JsonObject
 
 _PAPER_VIEWS = 1968
 """Views of a turn in the paper."""
@@ -598,7 +599,7 @@ def reconstruct_scan(folder: Path, options: dict[str, Any], out: str) -> tuple[l
         if k not in ("force", "no_progress", "workers", "threads", "scheduler", "command_line")
     }
 
-    def state() -> dict[str, Any]:
+    def state() -> JsonObject:
         return {
             "torchpcct": VERSION,
             "asked": asked,
@@ -628,7 +629,7 @@ def reconstruct_scan(folder: Path, options: dict[str, Any], out: str) -> tuple[l
     return messages, text, ""
 
 
-def _note(path: Path) -> dict[str, Any]:
+def _note(path: Path) -> JsonObject:
     """What :func:`reconstruct_scan` noted beside a volume; empty: nothing, or the file is
     somebody else's."""
     try:
@@ -726,7 +727,7 @@ def _config(
     scan: Scan | ScanSlices,
     grid: VolumeGrid,
     options: dict[str, Any],
-) -> dict[str, Any]:
+) -> JsonObject:
     from torchpcct.formats.geometry_yaml import geometry_values
 
     return {
@@ -744,7 +745,7 @@ def _config(
     }
 
 
-def _provenance(arguments: argparse.Namespace) -> dict[str, Any]:
+def _provenance(arguments: argparse.Namespace) -> JsonObject:
     return {
         "torchpcct": VERSION,
         "command": shlex.join(["torchpcct", *arguments.command_line]),
@@ -808,10 +809,10 @@ def _reconstruct_slabs(
 
 def _tell_volume(
     arguments: argparse.Namespace,
-    config: dict[str, Any],
+    config: JsonObject,
     grid: VolumeGrid,
     unit: str,
-    report: dict[str, Any],
+    report: JsonObject,
 ) -> None:
     size = " × ".join(map(str, grid.shape))
     spacing = " × ".join(f"{s:.4g}" for s in grid.spacing)

@@ -32,7 +32,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,10 +43,33 @@ from torchpcct.metrics.control import controlled_log_variance, controlled_mean
 from torchpcct.metrics.intervals import Estimate, Jackknifed, combined, log_of_sum
 from torchpcct.metrics.observer import d_prime, hotelling_scores
 
+if TYPE_CHECKING:
+    from torchpcct.typing import Ints
+
 __all__ = ["Record", "ReferenceNoise", "pivot", "records_of"]
 
 Floats = NDArray[np.float64]
-Record = dict[str, Any]
+
+
+class Record(TypedDict):
+    """A figure of a method at one exposure.
+
+    ``low`` and ``high`` end the 95 % interval of ``value`` from ``n`` realisations; NaN: it is
+    exact, or a time.
+    """
+
+    task: str
+    method: str
+    exposure_s: float
+    figure: str
+    where: str
+    value: float
+    low: float
+    high: float
+    unit: str
+    n: int
+
+
 _CONTRAST = (-1.0, 1.0)
 """Background less signal."""
 _LEAST_SLOPE = 0.05
@@ -105,7 +128,7 @@ class _Figures:
         )
         self._sign = np.sign(true)
 
-    def _row(self, roi: int, row: Any) -> Floats:
+    def _row(self, roi: int, row: tuple[float, float]) -> Floats:
         """Weights of an ROI's two means: signal, background."""
         out = np.zeros((len(self.true), 2))
         out[roi] = row
@@ -194,7 +217,7 @@ class _Figures:
     def invented(self) -> Jackknifed:
         """See the module, HU."""
 
-        def both(errors: Floats, halves: tuple[Any, Any]) -> float:
+        def both(errors: Floats, halves: tuple[Ints, Ints]) -> float:
             means = [errors[half].mean(0) for half in halves]
             return float(np.mean([_confirmed(*means), _confirmed(*means[::-1])]))
 
@@ -227,7 +250,7 @@ def _fall(profile: Floats) -> float:
     return max(0.0, float(np.concatenate(falls).max()))
 
 
-def joint(function: Callable[..., Any], *figures: Figure) -> Figure:
+def joint(function: Callable[..., float | Floats], *figures: Figure) -> Figure:
     """:func:`torchpcct.metrics.intervals.combined`, exact where all figures are."""
     if any(isinstance(f, Jackknifed) for f in figures):
         return combined(function, *figures)
@@ -279,7 +302,7 @@ def records_of(
     found: list[Record] = []
 
     def add(
-        figure: str, where: str, value: Any, unit: str = "", transform: float | None = None
+        figure: str, where: str, value: Figure, unit: str = "", transform: float | None = None
     ) -> None:
         """``transform`` t: of a logarithm, exp(t · value)."""
         if isinstance(value, Jackknifed):
@@ -358,7 +381,7 @@ def _log_square(figure: Figure) -> Figure:
     return joint(lambda v: 2.0 * np.log(np.maximum(np.abs(v), 1e-12)), figure)
 
 
-def _mean(values: Any) -> Jackknifed:
+def _mean(values: Floats) -> Jackknifed:
     return controlled_mean(values, None, None)
 
 

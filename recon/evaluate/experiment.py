@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from recon.evaluate.energies import BINS, EnergyRealisations, with_bins
 from recon.evaluate.estimates import Record, ReferenceNoise, records_of
 from recon.evaluate.measure import BLOCK, Measurement, Reader, Readings, kept_as
 from recon.evaluate.methods import Method, MethodLike, listed, method_of
-from recon.evaluate.realisations import Realisations
+from recon.evaluate.realisations import Realisations, Simulated
 from recon.evaluate.task import GroundTruth, Task
 from recon.evaluate.tasks import TaskLike, read_task
 from recon.jobs import execute
@@ -34,6 +34,9 @@ from recon.jobs.execute import Job, Unportable
 from recon.jobs.store import Store
 from torchpcct.files import atomic_write
 from torchpcct.validate import checked, numbers, whole
+
+if TYPE_CHECKING:
+    from torchpcct.typing import JsonObject
 
 __all__ = ["Evaluation", "TaskResult", "evaluate", "export_scans"]
 
@@ -75,7 +78,7 @@ class Evaluation:
 
     records: list[Record]
     results: list[TaskResult]
-    settings: dict[str, Any]
+    settings: JsonObject
 
 
 @checked
@@ -83,7 +86,7 @@ def evaluate(
     tasks: TaskLike | Sequence[TaskLike],
     methods: MethodLike | Sequence[MethodLike],
     *,
-    exposures_s: Any = None,
+    exposures_s: float | Sequence[float] | None = None,
     n: int = 20,
     seed: int = 0,
     folder: str | Path | None = None,
@@ -429,7 +432,9 @@ class _Bench:
         )
         return Measurement(method, realisations, reader, exposure)
 
-    def _pairs(self, exposure: float, k: range) -> Callable[[str | None], list[Any]]:
+    def _pairs(
+        self, exposure: float, k: range
+    ) -> Callable[[str | None], list[tuple[Simulated, Simulated]]]:
         """Realisations for an option ``energies``, drawn once for all methods, if one needs
         them."""
         return cache(lambda energies: [self.realisations_of(energies).pair(exposure, i) for i in k])
@@ -449,7 +454,7 @@ def _bench(folder: Path, packed: bytes) -> _Bench:
     return _Bench(folder, *pickle.loads(zlib.decompress(packed)))
 
 
-def _run_job(folder: Path, given: _Bench | bytes, job: str, *args: Any) -> None:
+def _run_job(folder: Path, given: _Bench | bytes, job: str, *args: object) -> None:
     bench = given if isinstance(given, _Bench) else _bench(folder, given)
     getattr(bench, job)(*args)
 
@@ -500,10 +505,10 @@ def _read(bench: _Bench, exposures: Sequence[float], n: int) -> tuple[list[Recor
 
 def measured_before(
     report: Path,
-    tasks: Sequence[Any],
+    tasks: Sequence[TaskLike],
     folder: Path,
     *,
-    exposures_s: Any = None,
+    exposures_s: float | Sequence[float] | None = None,
     n: int = 20,
     seed: int = 0,
 ) -> list[str]:
@@ -563,7 +568,12 @@ def measured_before(
 
 
 def _finished(
-    task: Task, method: Method, exposures_s: Any, n: int, seed: int, folder: Path
+    task: Task,
+    method: Method,
+    exposures_s: float | Sequence[float] | None,
+    n: int,
+    seed: int,
+    folder: Path,
 ) -> bool:
     """Whether all pieces of a method are there, of a task that it is measured at."""
     if method.energies is not None and not task.has_energies:
@@ -582,7 +592,7 @@ def export_scans(
     tasks: TaskLike | Sequence[TaskLike],
     folder: str | Path,
     *,
-    exposures_s: Any = None,
+    exposures_s: float | Sequence[float] | None = None,
     n: int = 20,
     seed: int = 0,
     progress: Progress | None = None,

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -21,11 +21,14 @@ from scipy import ndimage
 from torch import Tensor
 
 from recon.evaluate.methods import Method, Realisation
-from recon.evaluate.realisations import Realisations
+from recon.evaluate.realisations import Realisations, Simulated
 from recon.evaluate.task import BESIDE_MM, Task
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.observer import dog_channels, template_channel
 from torchpcct.volume import Volume
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Floats32
 
 Floats = NDArray[np.float64]
 
@@ -197,7 +200,7 @@ class Reader:
         mask = self.task.rim
         return float((volume - self.truth[0])[mask].min()) if mask.any() else 0.0
 
-    def flat(self, volume: Tensor) -> dict[str, Any]:
+    def flat(self, volume: Tensor) -> dict[str, Floats32]:
         """Voxels of every flat tissue."""
         return {t: volume.reshape(-1)[at].float().numpy() for t, at in self.task.flat.items()}
 
@@ -303,7 +306,7 @@ class Measurement:
             self._known = self.store.piece(f"{self._place}/response", self._key, respond)
             self._adjoints = torch.from_numpy(self._known["adjoints"])
 
-    def block(self, k: range, pairs: Callable[[], Sequence[Sequence[Realisation]]]) -> None:
+    def block(self, k: range, pairs: Callable[[], Sequence[Sequence[Simulated]]]) -> None:
         """Realisations ``k``; ``pairs`` gives them, if they have not been measured before."""
 
         def compute() -> dict[str, Any]:
@@ -347,7 +350,7 @@ class Measurement:
 
 
 def _measure_pairs(
-    pairs: Sequence[Sequence[Any]],
+    pairs: Sequence[Sequence[Simulated]],
     method: Method,
     reader: Reader,
     keep: bool,

@@ -124,7 +124,7 @@ class Method:
     energies: str | None = None
     made: tuple[Callable[..., Method], tuple[object, ...]] | None = None
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> tuple[object, ...]:
         return self.made or (Method, tuple(getattr(self, f.name) for f in fields(self)))
 
 

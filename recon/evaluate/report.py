@@ -13,10 +13,10 @@ import io
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,6 +24,13 @@ from recon.evaluate.estimates import Record
 from recon.evaluate.experiment import Evaluation, TaskResult
 from torchpcct.files import atomic_write
 from torchpcct.viz import base64_text
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from recon.evaluate.without_truth import Comparison
 
 __all__ = ["save", "text_of"]
 
@@ -60,14 +67,14 @@ def task_sections(evaluation: Evaluation) -> list[str]:
             "task": task,
             "values": dict(zip(ground_truth.tissues, ground_truth.values_hu, strict=True)),
             "true_hu": seen.true_hu,
-            "found": {tuple(r[k] for k in COLUMNS[1:5]): r for r in records},
+            "found": {(r["method"], r["exposure_s"], r["figure"], r["where"]): r for r in records},
             "n": evaluation.settings["n"],
         }
         sections.append(filled(Path(__file__).parent / "templates" / "evaluation.md.j2", given))
     return sections
 
 
-def plain(records: list[Record]) -> list[Record]:
+def plain(records: Iterable[Mapping[str, object]]) -> list[dict[str, object]]:
     """JSON values: None for NaN."""
     return [
         {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in r.items()}
@@ -86,7 +93,7 @@ def filled(template: Path, data: Mapping[str, Any]) -> str:
 
 
 @cache
-def templates(folder: Path) -> Any:
+def templates(folder: Path) -> Environment:
     """The ``jinja2.Environment`` of a folder's templates, where missing values are errors.
 
     Filters besides Jinja's: ``f(spec)``, a figure or the value of a record by Python's format, a
@@ -169,7 +176,7 @@ def save(evaluation: Evaluation, folder: str | os.PathLike[str], command: str = 
     return write_report(folder, "Evaluation", text, json.dumps(data, indent=1), pictures, more)
 
 
-def measured_text(rows: list[Record], unit: str, reference: str) -> str:
+def measured_text(rows: list[Comparison], unit: str, reference: str) -> str:
     """Markdown of noise at equal resolution.
 
     Args:
@@ -182,7 +189,11 @@ def measured_text(rows: list[Record], unit: str, reference: str) -> str:
 
 
 def save_measured(
-    rows: list[Record], unit: str, reference: str, folder: str | os.PathLike[str], command: str = ""
+    rows: list[Comparison],
+    unit: str,
+    reference: str,
+    folder: str | os.PathLike[str],
+    command: str = "",
 ) -> list[Path]:
     """Write ``report.md``, ``.json``, ``.csv`` and ``.html`` of :func:`measured_text`; the files
     written."""
@@ -248,19 +259,19 @@ def write_report(
     return [out / name for name in contents]
 
 
-def _picture(seen: TaskResult) -> Any:
+def _picture(seen: TaskResult) -> Figure:
     """The signal's fullest slice: truth, then every method at every exposure."""
     from matplotlib.figure import Figure
 
     z = int(seen.task.shares["signal"].sum((1, 2)).argmax())
-    methods: Any = list(dict.fromkeys(m for m, _ in seen.volumes))
+    methods = list(dict.fromkeys(m for m, _ in seen.volumes))
     exposures = sorted({e for _, e in seen.volumes})
     figure = Figure((2.0 * (len(methods) + 1), 2.2 * len(exposures)), dpi=120, layout="constrained")
-    axes: Any = figure.subplots(len(exposures), len(methods) + 1, squeeze=False)
+    axes = figure.subplots(len(exposures), len(methods) + 1, squeeze=False)
     middle = seen.ground_truth.values_hu[1]
     low, high = _WINDOW_HU if abs(middle) < 400 else (middle - 300.0, middle + 300.0)
     for row, exposure in zip(axes, exposures, strict=True):
-        shown: list[tuple[str, Any]] = [
+        shown: list[tuple[str, NDArray[np.floating]]] = [
             ("truth", seen.truth),
             *((m, seen.volumes[m, exposure][0]) for m in methods),
         ]

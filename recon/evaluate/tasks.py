@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from importlib import resources
 from pathlib import Path
-from typing import Any, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
 import numpy as np
 import torch
@@ -34,6 +34,9 @@ from torchpcct.scene.plaque.plaque import Plaque
 from torchpcct.scene.scene import Scene
 from torchpcct.validate import choice, number, numbers, whole
 from torchpcct.volume import Volume
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 __all__ = ["AnatomyTask", "VesselTask", "VoxelTask", "read_task"]
 
@@ -137,7 +140,7 @@ def _task(values: object, name: str, folder: Path) -> Task:
         raise ValueError(
             f"task {name}: {' and '.join(kinds)} are of different kinds of task: give one of them"
         )
-    make: Any = Task
+    make: type[Task] = Task
     if "voxels" in values:
         make, given = VoxelTask, given | _labels(f"task {name}: voxels", values["voxels"], folder)
     elif "vessel" in values:
@@ -166,7 +169,7 @@ def _inset(name: str, value: object, scene: Scene, signal: tuple[str, ...]) -> V
             f"{name}: unknown {', '.join(unknown)}; with size it takes voxel_mm and center"
         )
 
-    def triple(what: Any) -> list[float]:
+    def triple(what: Mapping[str, float] | Sequence[float]) -> list[float]:
         return [what[a] for a in "zyx"] if isinstance(what, Mapping) else list(what)
 
     size = numbers(f"{name}.size", triple(value["size"]), 3, positive=True, unit="mm")

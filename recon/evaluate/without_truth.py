@@ -14,9 +14,9 @@ voxels as fine as the cells, and what the coarse ones cannot show is left out.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 import torch
@@ -33,9 +33,30 @@ from torchpcct.scan import Scan
 from torchpcct.scan_grid import cells_at_axis, finite_cells
 from torchpcct.validate import checked, whole
 
+if TYPE_CHECKING:
+    from recon.mbir.mbir import Mbir
+
 __all__ = ["evaluate_scans", "evaluate_volumes"]
 
-Record = dict[str, Any]
+
+class Comparison(TypedDict):
+    """A method beside the linear reference, as :func:`evaluate_volumes` describes it."""
+
+    method: str
+    noise: float
+    noise_shared: float
+    noise_reference: float
+    dose_factor: float
+    low: float
+    high: float
+    f50: float
+    f50_z: float
+    resolution: float
+    resolution_z: float
+    why: str
+    note: str
+
+
 _REFERENCE = "fbp:ram-lak"
 """Linear method without apodisation, which shows the resolution that the data hold."""
 _COARSE = 1.05
@@ -55,7 +76,7 @@ class MeasuredRealisation:
 
     scan: Scan
     grid: VolumeGrid
-    noise: Any = None
+    noise: Callable[[Method, float], float] | None = None
 
     @property
     def label(self) -> str:
@@ -78,26 +99,27 @@ class MeasuredRealisation:
         found: Tensor = reconstruct(self.scan, self.grid, "pwls").data
         return found
 
-    def mbir(self, network: Any) -> Tensor:
+    def mbir(self, network: Mbir) -> Tensor:
         """The same."""
         found: Tensor = reconstruct(self.scan, self.grid, "mbir", network=network).data
         return found
 
     def sigma(self, method: Method, smooths: float = 0.0) -> float:
         """Noise of a linear method in HU."""
+        assert self.noise is not None
         return float(self.noise(method, smooths))
 
 
 @checked
 def evaluate_scans(
-    scans: Any,
+    scans: Scan | Sequence[Scan],
     grid: VolumeGrid,
     methods: MethodLike | Sequence[MethodLike],
-    region: Any = None,
+    region: object = None,
     *,
     n: int = 1,
     seed: int = 0,
-) -> list[Record]:
+) -> list[Comparison]:
     """Methods on two scans of one object, or on one scan of the whole detector in two halves of its
     views.
 
@@ -157,7 +179,9 @@ def evaluate_scans(
         pair = given if k == 0 else _exchanged(given, generator)
         found, reference = _reconstructed(pair, grid, names)
         measured = evaluate_volumes(found, reference, grid.spacing, region)
-        rows.append([{**row, "note": _note(given[0], grid)} for row in measured])
+        for row in measured:
+            row["note"] = _note(given[0], grid)
+        rows.append(measured)
     return rows[0] if n == 1 else [_mean(list(same)) for same in zip(*rows, strict=True)]
 
 
@@ -281,28 +305,36 @@ def _note(scan: Scan, grid: VolumeGrid) -> str:
     )
 
 
-def _mean(rows: list[Record]) -> Record:
+def _mean(rows: list[Comparison]) -> Comparison:
     """Of one method on several pairs: geometric means, without those of which nothing can be
     said."""
     sound = [r for r in rows if not r["why"]]
     if not sound:
         return rows[0]
-    keys = ("noise", "noise_shared", "noise_reference", "dose_factor", "low", "high")
+
+    def mean(values: Iterable[float]) -> float:
+        return math.exp(float(np.mean([math.log(v) for v in values])))
+
     return {
         **sound[0],
-        **{k: math.exp(float(np.mean([math.log(r[k]) for r in sound]))) for k in keys},
+        "noise": mean(r["noise"] for r in sound),
+        "noise_shared": mean(r["noise_shared"] for r in sound),
+        "noise_reference": mean(r["noise_reference"] for r in sound),
+        "dose_factor": mean(r["dose_factor"] for r in sound),
+        "low": mean(r["low"] for r in sound),
+        "high": mean(r["high"] for r in sound),
     }
 
 
 @checked
 def evaluate_volumes(
-    volumes: Any,
-    reference: Any,
-    voxel_mm: Any,
-    region: Any = None,
+    volumes: Mapping[str, Sequence[object]],
+    reference: Sequence[object],
+    voxel_mm: float | Sequence[float],
+    region: object = None,
     *,
     cells_mm: Sequence[float] | None = None,
-) -> list[Record]:
+) -> list[Comparison]:
     """Noise, resolution and the dose factor of noise at equal resolution of pairs of volumes.
 
     Args:
@@ -331,7 +363,8 @@ def evaluate_volumes(
     spacing = np.ravel(voxel_mm).astype(np.float64)
     spacing = np.array([spacing[0], *spacing]) if spacing.size == 2 else np.broadcast_to(spacing, 3)
     mask = None if region is None else np.asarray(region, bool).reshape(base.first.shape)
-    found, note = [], _condition(tuple(spacing), cells_mm)
+    note = _condition(tuple(spacing), cells_mm)
+    found: list[Comparison] = []
     for name, pair in dict(volumes).items():
         split = _split(name, pair)
         if split.first.shape != base.first.shape:
@@ -383,7 +416,7 @@ def _condition(spacing: Sequence[float], cells: Sequence[float] | None) -> str:
     )
 
 
-def _split(name: str, pair: Any) -> HalfSplit:
+def _split(name: str, pair: Sequence[object]) -> HalfSplit:
     first, second = (torch.as_tensor(np.asarray(v)).double() for v in pair)
     if first.shape != second.shape or first.ndim not in (2, 3):
         raise ValueError(

@@ -18,7 +18,7 @@ ray) the exact projections of :func:`recon.least_squares.pwls.pwls` repair.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 import torch
@@ -36,6 +36,9 @@ from torchpcct.projector import Projector
 from torchpcct.scan import Scan
 from torchpcct.spectral import SpectralModel, cramer_rao, decompose_surround, inverse, vmi_weights
 from torchpcct.validate import number
+
+if TYPE_CHECKING:
+    from torchpcct.typing import JsonObject
 
 __all__ = ["BasisProblem", "Whitening"]
 
@@ -186,7 +189,7 @@ class BasisProblem:
         *,
         dose: float = 1.0,
         **options: Unpack[PwlsOptions],
-    ) -> tuple[Tensor, dict[str, Any]]:
+    ) -> tuple[Tensor, JsonObject]:
         """Basis images.
 
         Args:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -31,6 +31,7 @@ from torchpcct.volume import in_words, to_hu
 if TYPE_CHECKING:
     from torchpcct.geometry import Geometry
     from torchpcct.metrics.residual_test import ResidualTest
+    from torchpcct.typing import JsonObject
 
 __all__ = ["FieldProblem"]
 
@@ -266,7 +267,7 @@ def larger_grid(grid: VolumeGrid, geometry: Geometry) -> VolumeGrid:
     return VolumeGrid(tuple(shape), grid.spacing, tuple(center))
 
 
-def joined(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def joined(reports: Sequence[JsonObject]) -> JsonObject:
     """One report of several slices: counts are added, the worst slice speaks for the rest."""
     worst = dict(
         max(reports, key=lambda r: (not r["converged"], r["rmsd_hu"][-1] if r["rmsd_hu"] else 0.0))

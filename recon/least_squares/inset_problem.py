@@ -6,7 +6,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 import torch
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from torchpcct.metrics.residual_test import ResidualTest
+    from torchpcct.typing import JsonObject
 
 
 class InsetProblem:
@@ -286,7 +287,7 @@ class InsetProblem:
         prior: QGGMRF,
         memory: int | None = None,
         **options: Unpack[MinimiseOptions],
-    ) -> tuple[Tensor, dict[str, Any]]:
+    ) -> tuple[Tensor, JsonObject]:
         """PWLS of data terms of one exposure: ``(batch, z, y, x)`` HU, and the solver's report.
 
         Args:

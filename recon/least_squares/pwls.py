@@ -139,13 +139,23 @@ GRAM_BYTES = 2**29
 """An FFT model that needs more is not built."""
 
 
+class PwlsProgress(TypedDict):
+    """What the ``callback`` of :func:`pwls` is called with before each outer iteration."""
+
+    outer: int
+    exact_pairs: int
+    gradient: float
+    rmsd_hu: float
+    x: Tensor
+
+
 class MinimiseOptions(TypedDict, total=False):
     """Options of :func:`minimise` that whoever calls it for a scan hands on; each is described at
     :func:`pwls`."""
 
     tolerance: float
     max_exact: int
-    callback: Callable[[dict[str, Any]], None] | None
+    callback: Callable[[PwlsProgress], None] | None
 
 
 class PwlsOptions(MinimiseOptions, total=False):
@@ -168,7 +178,7 @@ def pwls(
     tolerance: float = 0.2,
     max_exact: int = 200,
     memory: int | None = None,
-    callback: Callable[[dict[str, Any]], None] | None = None,
+    callback: Callable[[PwlsProgress], None] | None = None,
 ) -> Result:
     """Minimise ½‖y − A x‖²_W + R(x), in 2-D and 3-D, for an inset or a whole field of view.
 
@@ -341,7 +351,7 @@ def minimise(
     start: Tensor | None = None,
     tolerance: float = 0.2,
     max_exact: int = 200,
-    callback: Callable[[dict[str, Any]], None] | None = None,
+    callback: Callable[[PwlsProgress], None] | None = None,
 ) -> Result:
     """The volumes that minimise a data term and a prior, ½ xᵀHx − bᵀx + R(x), in mm⁻¹.
 

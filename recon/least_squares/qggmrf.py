@@ -32,7 +32,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -282,7 +282,7 @@ class BoundPrior:
 
     def value(self, x: Tensor) -> Tensor:
         """R(x), ``(...)``, without unit. Differentiable."""
-        total: Any = 0.0
+        total = x.new_zeros(())
         axes = tuple(range(-self.axes, 0))
         for t, (_, _, omega) in zip(self.gradients(x), self.offsets, strict=True):
             total = total + omega * self.potential(t).sum(dim=axes)

@@ -18,8 +18,8 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Hashable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -83,7 +83,7 @@ class UnknownSurround:
         self.coarse = self._first.grid
         self._left = Projector(self._second.inner, self.coarse)
         self._around = Projector(geometry, self.coarse, window)
-        self._last: tuple[Any, Tensor] | None = None
+        self._last: tuple[Hashable, Tensor] | None = None
 
     def volume(self, lines: Tensor) -> Tensor:
         """The whole field without the inset's details, ``coarse.shape`` mm⁻¹, from line integrals
@@ -239,7 +239,7 @@ class _Field:
         return torch.nan_to_num(fbp(extended, self._extended, self.grid, outside=outside))
 
 
-def _told(lines: Tensor) -> Any:
+def _told(lines: Tensor) -> Hashable:
     """What line integrals are told apart by: a hash or, of those on a device, from which nothing
     is to be copied, the sums of the bits of all views."""
     if lines.device.type == "cpu":

@@ -14,11 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from torch import Tensor
 
 from recon.data_term import Quadratic
+
+if TYPE_CHECKING:
+    from torchpcct.typing import JsonObject
 
 __all__ = ["Drawn", "Known"]
 
@@ -42,7 +45,7 @@ class Drawn:
 
     image: Tensor | None
     why: str = ""
-    report: dict[str, Any] = field(default_factory=dict)
+    report: JsonObject = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     objection: Callable[[Tensor], str] = _no_objection
 

@@ -36,6 +36,8 @@ from torchpcct.volume import in_words
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from torchpcct.typing import JsonObject
+
 
 __all__ = ["Mbir"]
 
@@ -440,7 +442,7 @@ def _ready(given: Prior | str) -> Prior:
 class _Note(NamedTuple):
     """What report and warnings of a volume hold beside."""
 
-    report: dict[str, Any]
+    report: JsonObject
     warnings: list[str]
 
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 from recon.least_squares.field_problem import is_whole_field
 from recon.least_squares.inset_problem import InsetProblem
@@ -16,6 +16,9 @@ from recon.result import Result
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 
+if TYPE_CHECKING:
+    from recon.mbir.priors import Prior
+
 __all__ = ["reconstruct_mbir"]
 
 
@@ -25,7 +28,7 @@ def reconstruct_mbir(
     progress: Callable[[float], None],
     *,
     network: Mbir | None = None,
-    prior: Any = None,
+    prior: Prior | str | None = None,
     problem: InsetProblem | None = None,
     batch: int = 4,
     fidelity: float | None = None,

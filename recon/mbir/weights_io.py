@@ -10,12 +10,15 @@ import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchpcct.files import atomic_write
+
+if TYPE_CHECKING:
+    from torchpcct.typing import JsonObject
 
 _HEADER = {"format", "sha256", "metadata", "sha256_of_metadata"}
 """Keys that every file has."""
@@ -64,7 +67,7 @@ def write_tensors(
         part.write_bytes(save(plain, header))
 
 
-def read_tensors(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def read_tensors(path: Path, kind: str) -> tuple[dict[str, Tensor], JsonObject]:
     """Tensors and metadata of a file of :func:`write_tensors`.
 
     Raises:

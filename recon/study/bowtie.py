@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike
 
-    from torchpcct.typing import Bools
+    from torchpcct.typing import Bools, JsonObject
 
 
 Floats = NDArray[np.float64]
@@ -167,7 +167,7 @@ def measure(
 ) -> Measured:
     """Dose, noise, and the plaque by FBP and MBIR, in resumable pieces."""
     s, pieces = settings, Pieces(folder, settings)
-    data: dict[str, Any] = {}
+    data: JsonObject = {}
     scenes = phantoms()
 
     scanners = wide_scanners(8)
@@ -575,7 +575,7 @@ def _combined(
 # --- the report -----------------------------------------------------------------------------------
 
 
-def checks(data: dict[str, Any]) -> list[Check]:
+def checks(data: JsonObject) -> list[Check]:
     """Doses and noise with over without the ROI bowtie, and the dose saved together with MBIR,
     beside the paper's."""
     p, r, noise = paper.BOWTIE, data["ctdi_ratios"]["plane"], data["noise"]

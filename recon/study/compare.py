@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -29,6 +29,12 @@ from torchpcct.metrics.roi import axial_grid, sample_axial
 from torchpcct.scanner import presets
 from torchpcct.validate import numbers
 from torchpcct.viz import Panel, panels
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from torchpcct.typing import JsonObject
 
 SCREEN = "compare_screen"
 """Template of what a terminal shows: the answer, the dose factors of every method, and where the
@@ -113,7 +119,7 @@ def measure(
     return Measured(s, data, found)
 
 
-def claim(records: list[dict[str, Any]]) -> dict[str, Any] | None:
+def claim(records: list[JsonObject]) -> JsonObject | None:
     """The paper's claim made testable, from records of an evaluation: MBIR at 0.35 s has the CNR of
     FBP at 2 s.
 
@@ -145,7 +151,7 @@ def claim(records: list[dict[str, Any]]) -> dict[str, Any] | None:
     }
 
 
-def figures(measured: Measured) -> dict[str, Any]:
+def figures(measured: Measured) -> JsonObject:
     """Axial and sagittal sections of one realisation at the largest exposure, the truth first,
     and without noise."""
     evaluation: Evaluation = measured.seen
@@ -155,7 +161,7 @@ def figures(measured: Measured) -> dict[str, Any]:
     section = VolumeGrid(
         (int(8.75 / image.spacing[1]), 1, image.shape[2]), image.spacing[1], image.center
     )
-    columns: list[tuple[str, Any]] = [("truth", seen.truth)]
+    columns: list[tuple[str, NDArray[np.floating]]] = [("truth", seen.truth)]
     for name in measured.settings.methods:
         columns.append((name.replace("@", "\n@ "), seen.volumes[name, dose][0]))
     rows: list[list[Panel]] = [[], []]
@@ -185,7 +191,7 @@ _BEYOND = 1000.0
 """Intervals are drawn to this factor, and its inverse."""
 
 
-def dose_chart(records: list[dict[str, Any]], settings: CompareSettings) -> Any:
+def dose_chart(records: list[JsonObject], settings: CompareSettings) -> Figure:
     """Dose factors with their intervals by question, a colour for each exposure; 1 and what the
     paper assumes marked.
 
@@ -198,7 +204,7 @@ def dose_chart(records: list[dict[str, Any]], settings: CompareSettings) -> Any:
 
     methods, exposures = list(settings.methods), sorted(settings.exposures_s)
     figure = Figure((12.4, 0.9 + 0.24 * len(methods)), dpi=110, layout="constrained")
-    panels: Any = figure.subplots(1, len(_QUESTIONS), sharey=True, squeeze=False)[0]
+    panels = figure.subplots(1, len(_QUESTIONS), sharey=True, squeeze=False)[0]
     for axes, (title, name, where) in zip(panels, _QUESTIONS, strict=True):
         axes.axvline(1.0, color="0.4", linewidth=1.0)
         axes.axvline(

@@ -27,7 +27,11 @@ from torchpcct.scene.materials import PLAQUE_MATERIALS, material
 from torchpcct.validate import numbers
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from matplotlib.figure import Figure
+
+    from torchpcct.typing import JsonObject
 
 
 Floats = NDArray[np.float64]
@@ -251,7 +255,7 @@ def counts() -> list[dict[str, object]]:
     return rows
 
 
-def _mean_energy(thresholds: Any, binned: Floats) -> float:
+def _mean_energy(thresholds: Sequence[float], binned: Floats) -> float:
     """Mean energy of the bins (their middle; the open one by the width of its neighbour),
     weighted by counts."""
     edges = np.append(thresholds, 2 * thresholds[-1] - thresholds[-2])
@@ -337,7 +341,7 @@ def _lines(scanner: Scanner, corrected: Scanner) -> Floats:
 # --- the report -----------------------------------------------------------------------------------
 
 
-def checks(data: dict[str, Any]) -> list[Check]:
+def checks(data: JsonObject) -> list[Check]:
     """Counts beside CatSim's beam, efficiency beside the published one, and that pile-up behind
     the body is small."""
     air, body = data["counts"]

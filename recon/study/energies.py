@@ -187,7 +187,7 @@ def _basis_noise(
     task: Task,
     kernel: str,
     functionals: list[Tensor],
-) -> Any:
+) -> Floats:
     """Covariances ``(pairs, pairs, 3)`` at 1 s of the functionals of FBP of the basis images, from
     readings decomposed at their Cramér–Rao bound."""
     columns, scale = model.cells(bins)

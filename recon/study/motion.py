@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from torch import Tensor
@@ -55,7 +55,7 @@ from torchpcct.viz import WINDOW_HU, Panel, panels
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from torchpcct.typing import Floats
+    from torchpcct.typing import Floats, JsonObject
 
 
 METHODS = {"fbp": "FBP", "pwls": "q-GGMRF PWLS", "mbir": "MBIR (learned prior)"}
@@ -178,7 +178,7 @@ def measure(
     reference = Reference.of(scene, plaque, inset_grid(plaque, s.voxel_mm))
     fractions = {"PCCT": (0.0, *s.fractions), "EID-CT": (0.0, *s.eid_fractions)}
     pieces.ahead(_scan, *((name, f) for name in SCANNERS for f in dict.fromkeys(fractions[name])))
-    data: dict[str, Any] = {}
+    data: JsonObject = {}
     for name in SCANNERS:
         still, moving = _residual(s, m, name, reference, pieces, progress)
         if name == "PCCT":
@@ -367,12 +367,12 @@ def _up_to(errors: Sequence[float], good: Sequence[bool]) -> float | None:
     return kept
 
 
-def _core_right(found: dict[str, Any]) -> bool:
+def _core_right(found: JsonObject) -> bool:
     """Whether a core was segmented where it is."""
     return bool(found["core_found"] and found["core_dice"] >= _DICE)
 
 
-def _borne(data: dict[str, Any]) -> dict[str, Any]:
+def _borne(data: JsonObject) -> JsonObject:
     """Up to which motion the PCCT's core survives: shares of the whole motion; None: not even the
     least was borne.
 
@@ -385,10 +385,10 @@ def _borne(data: dict[str, Any]) -> dict[str, Any]:
     series = [r["in_place"] for r in data["residual"] if r["scanner"] == "PCCT"]
     errors = (0.0, *s["errors"])
 
-    def kept(found: dict[str, Any]) -> bool:
+    def kept(found: JsonObject) -> bool:
         return bool(100.0 * abs(found["contrast_hu"] / rest["contrast_hu"] - 1.0) <= _TOLERANCE)
 
-    estimates: dict[str, list[dict[str, Any]]] = {}
+    estimates: dict[str, list[JsonObject]] = {}
     for c in data["compensated"]:
         if not c["noisy"] and c["error"] is not None:
             estimates.setdefault(c["method"], []).append(c["realizations"][0])
@@ -404,7 +404,7 @@ def _borne(data: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def checks(data: dict[str, Any]) -> list[Check]:
+def checks(data: JsonObject) -> list[Check]:
     """The motion itself, what lumen and core bear of it, and the EID-CT beside the PCCT."""
     s, rest = data["settings"], data["at_rest"]["PCCT"]
     series, eid = (
@@ -515,7 +515,8 @@ def _images(m: Found) -> Figure:
         f"C150 / W600 HU; error maps C0 / W{_ERROR_WIDTH_HU:g} HU. Outlines: lumen (red), core "
         "where segmented (yellow).",
     )
-    figure.set_size_inches(0.6 * figure.get_size_inches())  # ten rows of small images
+    width, height = 0.6 * figure.get_size_inches()  # ten rows of small images
+    figure.set_size_inches(width, height)
     return figure
 
 

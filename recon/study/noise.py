@@ -52,6 +52,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike
 
+    from torchpcct.typing import JsonObject
+
 
 Floats = NDArray[np.float64]
 
@@ -273,7 +275,7 @@ def _dose_table(s: NoiseSettings, m: Moments, exposure: float) -> list[dict[str,
     entries."""
     exact, values = m.exact(exposure), m.means[exposure]
 
-    def sampled(runs: Floats, i: int, **more: Any) -> dict[str, Any]:
+    def sampled(runs: Floats, i: int, **more: Any) -> JsonObject:
         table = measured_table(runs[:, i : i + 1])
         interval = list(cnr_interval(runs[:, i, 0], runs[:, i, 1]))
         return {
@@ -407,7 +409,7 @@ def measured_table(means: ArrayLike) -> RoiStatistics:
     return RoiStatistics(values.mean(-3), values.std(-3, ddof=1))
 
 
-def few_run_tables(mean: ArrayLike, covariance: Any, draws: int, seed: int) -> RoiStatistics:
+def few_run_tables(mean: ArrayLike, covariance: Floats, draws: int, seed: int) -> RoiStatistics:
     """Tables that so many experiments of ten realisations would report, whose ROI means
     ``(settings, 2)`` HU have this covariance ``(2 · settings, 2 · settings)`` HU²."""
     rng, parts = np.random.default_rng(seed), []
@@ -497,7 +499,7 @@ def pair_differences(
 # --- the report -----------------------------------------------------------------------------------
 
 
-def checks(data: dict[str, Any]) -> list[Check]:
+def checks(data: JsonObject) -> list[Check]:
     """The paper's tables beside the exact figures, the slope of the noise, and the full
     reconstructions."""
     found = []
@@ -600,11 +602,12 @@ def _images(s: NoiseSettings, m: Moments) -> Figure:
         f"FBP of one noise realisation, {s.table_exposure_s:g} s, axial",
         "C150 / W600 HU. ROI outlines (top row): necrotic core (blue), fibrous tissue (red).",
     )
-    figure.set_size_inches(_IMAGES_SCALE * figure.get_size_inches())
+    width, height = _IMAGES_SCALE * figure.get_size_inches()
+    figure.set_size_inches(width, height)
     return figure
 
 
-def _cnrs(s: NoiseSettings, rows: list[dict[str, Any]]) -> Figure:
+def _cnrs(s: NoiseSettings, rows: list[JsonObject]) -> Figure:
     """CNR of every setting: exact, n realisations with interval, range of 10-run experiments,
     the paper's."""
     from matplotlib.figure import Figure

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
@@ -26,9 +26,11 @@ from torchpcct.validate import number, numbers
 from torchpcct.viz import Panel, panels
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from matplotlib.figure import Figure
 
-    from torchpcct.typing import Floats, Ints
+    from torchpcct.typing import Floats, Ints, JsonObject
 
 
 TRANSMITTED = "100 kVp behind 24 cm fat"
@@ -85,7 +87,7 @@ def measure(
     hu = ct_numbers(settings.energies_kev)
     published = {name: value for name, (_, value, _) in paper.MATERIALS.items()}
     soft = ("vessel_wall", "fibrous_tissue", "necrotic_core")
-    data: dict[str, Any] = {
+    data: JsonObject = {
         "materials": compositions(),
         "hu": hu,
         "published_hu": published,
@@ -250,7 +252,7 @@ def raster_lengths(
 
 
 def _raster(
-    scene: Scene, plaque: Plaque, center: Any, half: Any, voxel_mm: float
+    scene: Scene, plaque: Plaque, center: Sequence[float], half: Sequence[float], voxel_mm: float
 ) -> tuple[Ints, Floats]:
     """Labels ``(z, y, x)`` of a box in the plaque's frame, and its points in the scanner's."""
     n = [max(1, 2 * math.floor(h / voxel_mm) + 1) for h in half][::-1]
@@ -263,7 +265,7 @@ def _raster(
 # --- the report -----------------------------------------------------------------------------------
 
 
-def checks(data: dict[str, Any]) -> list[Check]:
+def checks(data: JsonObject) -> list[Check]:
     """Densities, mass fractions, CT numbers and lengths with what is accepted of them."""
     found = []
     for m in data["materials"]:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
@@ -32,6 +32,8 @@ from torchpcct.validate import number, numbers
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
+
+    from torchpcct.typing import JsonObject
 
 
 _EDGE_MM = 9.2
@@ -131,7 +133,7 @@ def measure(
     return Measured(s, data)
 
 
-def shown_by_mbir(report: Mapping[str, Any]) -> str:
+def shown_by_mbir(report: JsonObject) -> str:
     """The rows of MBIR with the weights that ship, as :mod:`recon.mbir.shown` reads them: JSON.
 
     Args:
@@ -203,7 +205,7 @@ def _rows(
     return [row.as_dict() for row in found]
 
 
-def _pooled(exposure_s: float, rows: Sequence[Mapping[str, Any]]) -> dict[str, object]:
+def _pooled(exposure_s: float, rows: Sequence[JsonObject]) -> dict[str, object]:
     """One ball and method over the realisations."""
     first = rows[0]
     together = ContrastRecovery(

@@ -16,7 +16,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from recon.evaluate.report import filled, write_report
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from torchpcct.typing import Json
+    from torchpcct.typing import Json, JsonObject
 
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -142,7 +142,7 @@ class Report:
     """
 
     name: str
-    data: dict[str, Any]
+    data: JsonObject
     figures: dict[str, Figure] = field(default_factory=dict)
     screen_template: str = ""
 

@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,8 @@ from torchpcct.viz import panels
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike
+
+    from torchpcct.typing import JsonObject
 
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
@@ -128,7 +130,7 @@ def measure(
     pieces = Pieces(folder, settings)
     scene, plaque = plaque_scene()
     seen: dict[str, Imaged] = {}
-    entries: dict[str, dict[str, Any]] = {}
+    entries: dict[str, JsonObject] = {}
     for name in SCANNERS:
         seen[name], entries[name] = _image(
             name, (scene, plaque), settings, pieces.within(name), partial(progress, name)
@@ -306,7 +308,7 @@ def blur_series(image: Tensor, truth: Truth, sigmas_px: Sequence[float]) -> list
     return series
 
 
-def limits(series: list[PlaqueImage], tolerance: float) -> dict[str, Any]:
+def limits(series: list[PlaqueImage], tolerance: float) -> JsonObject:
     """Where a blur series loses what: blurs in pixels.
 
     Returns:
@@ -338,7 +340,7 @@ def crossing(x: ArrayLike, values: ArrayLike, limit: float) -> float:
 # --- the report -----------------------------------------------------------------------------------
 
 
-def checks(data: dict[str, Any]) -> list[Check]:
+def checks(data: JsonObject) -> list[Check]:
     """The protocol's limits of the PCCT, and what the EID-CT loses, beside the paper's."""
     p, e, published, found = (
         data["scanners"]["PCCT"],

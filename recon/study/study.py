@@ -26,12 +26,15 @@ import re
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar, Self, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
 
 import numpy as np
 
 import torchpcct
 from torchpcct.validate import whole
+
+if TYPE_CHECKING:
+    from torchpcct.typing import JsonObject
 
 Progress = Callable[[str, float], None]
 """Called with the name of a step (after a bar, ``|``, what changes in the meantime) and its
@@ -155,7 +158,7 @@ class Measured:
     """
 
     settings: Any
-    data: dict[str, Any]
+    data: JsonObject
     seen: Any = None
     seconds: dict[str, float] = field(default_factory=dict)
 

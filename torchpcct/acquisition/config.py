@@ -242,7 +242,8 @@ def _scene(value: object, folder: Path) -> tuple[Scene | VoxelScene, dict[str, o
         known = (*_parameters(plaque_scene), *(f.name for f in fields(Plaque)), "variant", "bodies")
         made = plaque_variant(variant, **_mapping("scene", own, known))[0]
     else:
-        make: Any = {"thorax": thorax, "water": water_cylinder}[kind]
+        makers: dict[str, Callable[..., Scene]] = {"thorax": thorax, "water": water_cylinder}
+        make = makers[kind]
         made = _build("scene", make, _mapping("scene", own, (*_parameters(make), "bodies")))
     return (made.add(*more) if more else made), {"kind": kind, **given}
 
@@ -268,7 +269,7 @@ def _voxels(given: dict[str, Any], folder: Path) -> tuple[VoxelScene, dict[str, 
     volume = Volume.load(folder / given["file"])
     if volume.unit != "HU":
         raise ValueError(f"{given['file']} is in {volume.unit}: a scene is made of a volume in HU")
-    dense: Any = given.get("dense", "bone")
+    dense = given.get("dense", "bone")
     description = {
         "kind": "volume",
         "file": str((folder / given["file"]).resolve()),

@@ -115,7 +115,7 @@ def _source(value: object, folder: Path) -> Source:
 def _detector(value: object) -> SiliconDetector | Scintillator:
     given = dict(value) if isinstance(value, Mapping) else {}
     kind = choice("scanner.detector.kind", given.pop("kind", None), tuple(_DETECTORS))
-    made: Any = _DETECTORS[kind]
+    made = _DETECTORS[kind]
     given = _mapping("scanner.detector", given, tuple(f.name for f in fields(made)))
     if "material" in given:
         given["material"] = material(str(given["material"]))

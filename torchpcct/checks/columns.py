@@ -15,7 +15,6 @@ the columns.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import torch
@@ -90,7 +89,7 @@ def column_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     return ScanTest({"gain": gain, "place": place}, {"place": error}, tuple(findings))
 
 
-def _gain(blocks: Floats, g: Any) -> tuple[float, str]:
+def _gain(blocks: Floats, g: Geometry) -> tuple[float, str]:
     """Largest gain error, and what to say of it."""
     columns = g.columns
     u = np.asarray(g.column_positions)

@@ -201,7 +201,7 @@ def geometry_values(geometry: Geometry) -> dict[str, object]:
     degrees = np.rad2deg(geometry.angles)
     step = float(degrees[1] - degrees[0]) if degrees.size > 1 else 0.0
     even = degrees[0] + step * np.arange(degrees.size)
-    angles: Any = degrees.tolist()
+    angles: list[float] | dict[str, float] = degrees.tolist()
     if math.isclose(float(np.abs(even - degrees).max()), 0.0, abs_tol=1e-9):
         angles = {"start": float(degrees[0]), "step": step, "count": int(degrees.size)}
     values: dict[str, object] = {"kind": kind, "angles_deg": angles}

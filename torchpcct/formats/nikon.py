@@ -12,7 +12,7 @@ import os
 import re
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 
@@ -120,11 +120,11 @@ def read_xtekct(
             (0.0, offset),
         )
         names = _images(Path(path), about, views)
-        info: dict[str, Any] = {"file": str(path), "format": "Nikon"}
+        info: dict[str, object] = {"file": str(path), "format": "Nikon"}
         pick = None
         if slices is not None:
-            geometry, info["slices"] = sliced(geometry, slices, rows)
-            first, stop, _ = info["slices"]
+            geometry, kept = sliced(geometry, slices, rows)
+            info["slices"], (first, stop, _) = kept, kept
 
             def pick(shape: tuple[int, ...]) -> tuple[slice, ...]:
                 return (slice(None), slice(rows - stop, rows - first), slice(None))

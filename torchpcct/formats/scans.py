@@ -311,8 +311,9 @@ def _placed(scan: Scan, geometry: VectorGeometry) -> Scan:
     if scan.window is not None:
         raise ValueError("this scan holds a part of the detector: a VectorGeometry needs all of it")
     turned = geometry.has_rows and not scan.geometry.has_rows and scan.counts.ndim == 3
-    changed = scan.each(lambda readings: readings.movedim(0, 1).contiguous()) if turned else {}
-    return replace(scan, geometry=geometry, **changed)
+    if turned:
+        scan = replace(scan, **scan.each(lambda readings: readings.movedim(0, 1).contiguous()))
+    return replace(scan, geometry=geometry)
 
 
 def _is_own(path: Path) -> bool:

@@ -8,7 +8,7 @@ source turns clockwise.
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 
@@ -79,11 +79,11 @@ def read_txrm(
         check_expansion((count, height, width), "the scan", os.stat(path).st_size)
         geometry = _geometry(held, count, height, width)
         rows = slice(None)
-        info: dict[str, Any] = {"file": str(path), "format": "Zeiss"}
+        info: dict[str, object] = {"file": str(path), "format": "Zeiss"}
         if slices is not None:
             slice_axis(geometry, (count, height, width))
-            geometry, info["slices"] = sliced(geometry, slices, height)
-            rows = slice(*info["slices"][:2])
+            geometry, kept = sliced(geometry, slices, height)
+            info["slices"], rows = kept, slice(*kept[:2])
         readings = np.stack(
             [
                 held.image(f"ImageData{k // _A_STORAGE + 1}/Image{k + 1}", kind, height, width)[

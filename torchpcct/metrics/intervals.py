@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,7 +121,7 @@ class Jackknifed:
 
 
 @checked
-def combined(function: Callable[..., Any], *figures: Jackknifed | float) -> Jackknifed:
+def combined(function: Callable[..., float | Floats], *figures: Jackknifed | float) -> Jackknifed:
     """A smooth function of figures of the same realisations; numbers are taken as exact.
 
     Args:

@@ -179,7 +179,7 @@ class Engine:
         return worst
 
 
-_ANGLES = (0.1, 1.9, 4.0)
+_ANGLES = np.array([0.1, 1.9, 4.0])
 _PLANE = VolumeGrid((9, 8), 2.0, (1.0, -2.0))
 _SMALL: dict[type[Geometry], tuple[Geometry, VolumeGrid]] = {
     ParallelBeam: (ParallelBeam(_ANGLES, 15, 1.9), _PLANE),

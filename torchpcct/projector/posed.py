@@ -10,7 +10,7 @@ poses says nothing.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol, cast
+from typing import TYPE_CHECKING, NoReturn, Protocol, cast
 
 import numpy as np
 import torch
@@ -51,7 +51,7 @@ class PosedEngine:
         window: DetectorWindow | None = None,
         motion: Tensor | None = None,
     ) -> None:
-        base: Any = scan.base
+        base = scan.base
         if isinstance(base, VectorGeometry):
             if window is not None:
                 raise ValueError(

@@ -66,8 +66,7 @@ class Scanner:
                 raise TypeError(
                     f"{field_name} must be a {kind.__name__}, got {type(value).__name__}"
                 )
-        bowties: Any = self.bowties
-        bowties = (bowties,) if isinstance(bowties, Bowtie) else tuple(bowties or ())
+        bowties = (self.bowties,) if isinstance(self.bowties, Bowtie) else tuple(self.bowties or ())
         if not all(isinstance(b, Bowtie) for b in bowties):
             raise TypeError(f"bowties must be Bowtie objects, got {self.bowties!r}")
         width = number("energy_bin_kev", self.energy_bin_kev, low=0.1, high=5.0, unit="keV")
@@ -178,7 +177,7 @@ class _Optics:
 
     @classmethod
     def of(cls, scanner: Scanner) -> _Optics:
-        geometry = replace(scanner.geometry, angles=(0.0,))
+        geometry = replace(scanner.geometry, angles=np.zeros(1))
         return cls(
             geometry, scanner.source, scanner.filters, scanner.bowties, scanner.energy_bin_kev
         )

@@ -38,7 +38,7 @@ _NEGLIGIBLE = 1e-6
 the photons."""
 
 
-def slabs(name: str, value: Any) -> Slabs:
+def slabs(name: str, value: Iterable[tuple[Material, float]]) -> Slabs:
     """Validate ``((material, thickness in mm), …)``: homogeneous slabs that every ray crosses.
 
     Raises:

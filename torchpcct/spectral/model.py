@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -257,8 +257,8 @@ class SpectralModel:
     def rays(
         self,
         shape: tuple[int, ...],
-        columns: Any = None,
-        scale: Any = None,
+        columns: object = None,
+        scale: object = None,
     ) -> tuple[Ints, Floats]:
         """Column indices (int64) and intensities (float64) of rays of a shape, flat arrays.
 

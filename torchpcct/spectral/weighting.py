@@ -47,7 +47,7 @@ _SAMPLES = 400
 """Water thicknesses at which pile-up is known for the water correction."""
 
 
-class BinWeights(np.ndarray[Any, np.dtype[np.float64]]):
+class BinWeights(np.ndarray[tuple[int, int], np.dtype[np.float64]]):
     """An array ``(bins, columns)`` of weights that knows what it was made for.
 
     Attributes:

@@ -157,7 +157,7 @@ def _views(title: str, keep: Callable[[int], NDArray[np.integer]]) -> Case:
 
 
 def _described(
-    title: str, change: Callable[[Any], Any], unseen: str = "", tissues: bool = False
+    title: str, change: Callable[[ConeBeam], ConeBeam], unseen: str = "", tissues: bool = False
 ) -> Case:
     """The geometry is described wrongly."""
     return Case(

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from torchpcct.metrics.roi import RoiMean
+    from torchpcct.scene.materials import Material
+    from torchpcct.typing import JsonObject
 
 
 INSET_MM = (11.3, 9.0, 9.0)
@@ -164,7 +166,10 @@ _MARGIN_MM = 1.0
 
 
 def rod_values(
-    scene: Scene, scanner: Scanner, position: tuple[float, ...], tissues: Mapping[str, Any]
+    scene: Scene,
+    scanner: Scanner,
+    position: tuple[float, ...],
+    tissues: Mapping[str, Material | str],
 ) -> dict[str, float]:
     """True values of tissues: the HU of a rod of each at the plaque's place, tissue → HU.
 
@@ -260,13 +265,13 @@ class PlaqueImage:
 
     image: Tensor
     segmentation: PlaqueSegmentation
-    measures: dict[str, Any]
+    measures: JsonObject
 
     def __getitem__(self, name: str) -> Any:
         return self.measures[name]
 
 
-def measure_plaque(image: Tensor, truth: Truth, **more: Any) -> PlaqueImage:
+def measure_plaque(image: Tensor, truth: Truth, **more: object) -> PlaqueImage:
     """Segment and measure an axial image ``(y, x)`` HU on ``truth.image``; ``more``: measures of
     the study's own."""
     found = segment_plaque(image, truth.image)

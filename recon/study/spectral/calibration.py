@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -22,6 +22,9 @@ from torchpcct.spectral import (
     decompose_surround,
     vmi,
 )
+
+if TYPE_CHECKING:
+    from torchpcct.typing import JsonObject
 
 SHOWN_KEV = (52.0, 70.0)
 """Energies at which wrong calibrations are compared: the paper's best, and one where contrasts
@@ -122,9 +125,7 @@ def decomposed(
     return fbp.images(found.line_integrals)[0][0], float((~found.converged).double().mean())
 
 
-def calibration_costs(
-    s: Any, tissues: Tissues, progress: Callable[[float], None]
-) -> dict[str, Any]:
+def calibration_costs(s: Any, tissues: Tissues, progress: Callable[[float], None]) -> JsonObject:
     """HU of the tissues, contrast and tissue maps with every wrong calibration; the noise of the
     study's own scan, of which ``tissues`` are, is the unit of the maps' distances.
 
@@ -163,7 +164,7 @@ def calibration_costs(
     return {"views": s.calibration_views, "energies_kev": list(SHOWN_KEV), "cases": rows}
 
 
-def _read(scan: SpectralScan, tissues: Tissues, images: Tensor) -> dict[str, Any]:
+def _read(scan: SpectralScan, tissues: Tissues, images: Tensor) -> JsonObject:
     """HU of the tissues and of the contrast by energy, and Dice coefficients of the tissue map."""
     lumen = torch.from_numpy(
         scan.scene.volume_fractions(scan.grid)[scan.scene.index(BODIES["blood_iodine"])] > _PURE

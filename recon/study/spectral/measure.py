@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-    from torchpcct.typing import Reals
+    from torchpcct.typing import JsonObject, Reals
 
 
 VISIBLE_DICE = 0.5
@@ -167,7 +167,7 @@ def measure(
     s, pieces, spent = settings, Pieces(folder, settings), time.process_time()
 
     scan = SpectralScan(s, lambda fraction: progress("simulate", fraction), pieces=pieces)
-    data: dict[str, Any] = {"plan": scan.clean.info["plan"]}
+    data: JsonObject = {"plan": scan.clean.info["plan"]}
     progress("simulate", 1.0)
     noise_free = scan.fbp.images(scan.exact.line_integrals)[0][0]
     lines, volumes, data["rays"] = [], [], []
@@ -233,7 +233,7 @@ def _curve(curve: VmiCurve) -> dict[str, object]:
     }
 
 
-def _vmi(scan: SpectralScan, images: Images) -> dict[str, Any]:
+def _vmi(scan: SpectralScan, images: Images) -> JsonObject:
     """Contrast of core and fibrous tissue, noise and CNR against energy."""
     foreground, background = scan.rois.on(scan.grid)
     core, fibrous = (roi(images.clean).numpy() for roi in (foreground, background))
@@ -281,10 +281,10 @@ def _mbir(
     tissues: Tissues,
     lines: list[Tensor],
     images: Images,
-    curves: dict[str, Any],
+    curves: JsonObject,
     pieces: Pieces,
     progress: Progress,
-) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+) -> tuple[JsonObject, list[JsonObject]]:
     """Joint MBIR at every noise level, and its scores; volumes of the first realisation go to
     ``images``."""
     s = scan.settings
@@ -326,7 +326,7 @@ def _mbir(
 # --- the report -----------------------------------------------------------------------------------
 
 
-def checks(data: dict[str, Any]) -> list[Check]:
+def checks(data: JsonObject) -> list[Check]:
     """The decomposition at its bound, the best energy, and what noise leaves of the core, beside
     the paper's."""
     rays, curves, fbp = data["rays"], data["vmi"], data["dice"]["FBP"]

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchpcct.projector.tables import Tables
+
+if TYPE_CHECKING:
+    from torchpcct.typing import Floats
 
 LANES = 128
 """Columns or voxels of a program of a plane; of a cone beam twice as many rows or slices."""
@@ -84,7 +87,7 @@ class GpuPasses:
             dz / pitch,
         ]
 
-        def sent(values: Any) -> Tensor:
+        def sent(values: Floats) -> Tensor:
             return torch.from_numpy(np.ascontiguousarray(values)).to(self.device, dtype)
 
         return _Numbers(
@@ -291,7 +294,7 @@ class _Segments:
             ends beyond it.
     """
 
-    def __init__(self, tables: Tables, cells: Any, axis: int, device: torch.device) -> None:
+    def __init__(self, tables: Tables, cells: Floats, axis: int, device: torch.device) -> None:
         whole, table, buckets, begin = [], [], [np.zeros(0, np.int32)], 0
         parallel = tables.rays.parallel
         chosen = tables.segments.table[tables.segments.table[:, 1] == axis]
@@ -325,13 +328,13 @@ class _Segments:
         return int(first), int(last)
 
 
-def _bits(cells: Any, slabs: int) -> int:
+def _bits(cells: Floats, slabs: int) -> int:
     """Of the whole numbers that places are computed in: as many as the largest leaves room for."""
     p, q = np.abs(cells[..., :4:2]).max(initial=1.0), np.abs(cells[..., 1:4:2]).max(initial=1.0)
     return 61 - math.ceil(math.log2(p + q * slabs + slabs))
 
 
-def _touched(cells: Any, axes: Any, tables: Tables, nearest: float) -> int:
+def _touched(cells: Floats, axes: object, tables: Tables, nearest: float) -> int:
     """Voxels that a cell of a plane touches in a slab at most."""
     ny, nx = tables.grid.shape[-2:]
     p0, q0, p1, q1, l0, l1 = np.moveaxis(cells[..., :6], -1, 0)

@@ -22,7 +22,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from torchpcct.scene.bodies import Ellipsoid, EllipticCylinder, Floats
 from torchpcct.scene.materials import Material, material
@@ -68,17 +68,17 @@ class Plaque:
         ValueError, TypeError: a value out of range or of the wrong kind; the message names it.
     """
 
-    position: Any = PAPER_POSITION
+    position: tuple[float, float, float] = PAPER_POSITION
     orientation: float = 0.0
     vessel_diameter: float = 3.36
     wall_thickness: float = 0.19
     cap_thickness: float = 0.17
-    core_semi_axes: Any = (0.6, 0.985, 0.985)
+    core_semi_axes: tuple[float, float, float] = (0.6, 0.985, 0.985)
     bulge: float = 0.45
     bulge_length: float = 6.0
     vessel_length: float = 230 * 0.042
     lumen_narrowing: float = 1.0
-    core_shift: Any = (0.0, 0.0, 0.0)
+    core_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     core_scale: float = 1.0
 
     def __post_init__(self) -> None:
@@ -228,7 +228,7 @@ def _gap(lumen: NarrowedTube, center: tuple[float, ...], axes: tuple[float, ...]
 
     c, s = np.array(center), np.array(axes)
 
-    def gap(v: NDArray[np.float64]) -> Any:
+    def gap(v: Floats) -> Floats:
         theta, phi = v[:2]
         x, y, z = (
             c[0] - s[0] * np.cos(theta) * np.cos(phi),
