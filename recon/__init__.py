@@ -30,6 +30,7 @@ _SOURCES = {
     "METHODS": "recon.names",
     "reconstruct": "recon.api",
 }
+"""Where the names of the package come from, at their first use."""
 
 
 def __getattr__(name: str) -> object:

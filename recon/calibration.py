@@ -67,11 +67,14 @@ shifts a quarter."""
 _LEAST_SHARE = 0.05
 """Of a number's effect on the readings that no volume explains, below which it is refused."""
 _LARGEST_COLUMNS = 1.0
+"""Standard error in columns from which on a shift is not determined, and the largest step of an
+iteration."""
 _LARGEST_DEGREES = 2.0
+"""The same of a turn, in degrees."""
 _LARGEST_PART = 0.03
-"""Standard error in columns, degrees, or parts of sdd, from which on a number is not determined;
-and the largest step of an iteration."""
+"""The same of sdd, as a part of it."""
 _STEPS = 8
+"""Most iterations."""
 _ALIKE = 0.95
 """Correlation of two numbers' effects from which on one may stand for the other."""
 _NEAR = 0.1

@@ -30,6 +30,7 @@ _ENERGIES = re.compile(r"(?P<before>[:,])energies(?:=(?P<contrast>[^,@]*))?(?=,|
 """The option among those of a method, wherever it stands."""
 
 _MBIR = ("weights", "network", "fidelity", "vessel", "tissues", "prior")
+"""Options of MBIR in a method's name."""
 
 
 def filter_name(text: str) -> str:

@@ -18,6 +18,7 @@ __all__ = ["Result"]
 _LOG = logging.getLogger(__name__)
 
 RESIDUAL_TEST = "the test of what the volume leaves of the readings"
+"""Name of :mod:`torchpcct.metrics.residual_test` in messages."""
 
 T = TypeVar("T")
 

@@ -53,6 +53,7 @@ _LAZY = {
     "VoxelScene": "torchpcct.scene.voxels",
     "acquire": "torchpcct.acquisition.acquire",
 }
+"""Names of the package that are imported at their first use, and from where."""
 
 
 def _check_cache(folder: str, home: str) -> None:

@@ -13,6 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 _TEMPORARY = "torchpcct-kernels-"
+"""How the name of a folder of kernels begins that goes when the process ends."""
 
 
 def ensure_cache() -> None:

@@ -28,10 +28,11 @@ _VERSION = 5
 (:func:`torchpcct.files.write_hdf5`). 4: parallel and fan beams, flux, dead readings, units. 5:
 geometries given view by view; the region of a window, which earlier files lack and earlier readers
 leave aside."""
-# Compress in blocks of one view: fast to write, and a window of views, or of rows, can be read
-# without the rest.
 _CHUNK_ROWS = 64
+"""Readings are compressed in blocks of one view and so many rows: fast to write, and a window of
+views, or of rows, can be read without the rest."""
 _HDF5_COMPRESSION = {"compression": "lzf", "shuffle": True}
+"""Filters of the readings: both come with HDF5."""
 
 
 class NoSlicesError(ValueError):

@@ -24,6 +24,7 @@ MOST = 6
 MOST_SCANS = 4
 """Scans of which anything is kept: the latest."""
 _TENSORS = ("counts", "air", "surround", "quantum", "dead")
+"""Members of a scan whose change forgets what was found out about it."""
 
 _found: OrderedDict[int, tuple[weakref.ref[Scan], Hashable, OrderedDict[Hashable, Any]]]
 _found = OrderedDict()

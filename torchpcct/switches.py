@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 _ERRORS = {"divide": "warn", "over": "warn", "under": "ignore", "invalid": "warn"}
 """As numpy has them."""
 _NOTHING = nullcontext()
+"""Where no switch has to be put back."""
 
 F = TypeVar("F", bound=Callable[..., object])
 

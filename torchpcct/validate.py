@@ -154,6 +154,7 @@ _UNITS = {
     "B": 1,
     **{f"{p}{b}": k**n for n, p in enumerate("KMGT", 1) for b, k in (("B", 1000), ("IB", 1024))},
 }
+"""Units of memory → bytes: of 1000 (KB, MB, GB, TB) and of 1024 (KiB, MiB, GiB, TiB)."""
 
 
 def memory_bytes(value: int | str) -> int:
@@ -277,6 +278,7 @@ _SAID = {
     "Geometry": "a ParallelBeam, FanBeam or ConeBeam (or a VectorGeometry)",
     "tuple": "a sequence",
 }
+"""Annotations that their own names do not describe, in words."""
 
 
 def checked(function: F) -> F:

@@ -31,6 +31,7 @@ CLIMB = 0.05
 """Way of the source along z that makes an orbit a helix, as a share of the height that the rows
 cover at the axis."""
 _TILTED_RAY = 1e-3
+"""Sine of a parallel ray's angle with the plane of the circle that is no rounding."""
 
 
 class IdealCircle(NamedTuple):

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 __all__ = ["backproject"]
 
 _KIND = {"parallel": 0, "flat": 1, "curved": 2}
+"""Detectors by the number that the kernels know."""
 _TILES = ((12, 24), (8, 12))
 """Voxel columns of one task of the 3-D backprojection: small enough for the caches, large enough to
 share look-ups."""

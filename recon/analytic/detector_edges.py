@@ -39,6 +39,7 @@ _LEFT_OUT = 0.1
 _FEWEST_COLUMNS = 4
 """Readings that a cylinder is fitted to at least; rows of fewer are not continued."""
 _WIDEST_RAD = math.radians(85.0)
+"""Fan angle up to which a row is continued: at 90° a flat detector ends nowhere."""
 
 
 class Rows(NamedTuple):

@@ -30,10 +30,11 @@ if TYPE_CHECKING:
 CHUNK_BYTES = 48 * 2**20
 """Intermediate results of filtering are kept near this size; larger scans are processed in chunks
 of views."""
-# : Matrix products and FFTs per nanosecond on a common core, only used to choose the faster of the
-# two.
 _GEMM_FLOPS = 40.0
+"""Operations of matrix products per nanosecond on a common core, only used to choose the faster of
+these and FFTs."""
 _FFT_FLOPS = 4.0
+"""Operations of FFTs per nanosecond."""
 
 
 def _lookup(kernels: NDArray[np.float64], lag: NDArray[np.int64]) -> NDArray[np.float64]:

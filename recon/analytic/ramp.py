@@ -26,7 +26,9 @@ __all__ = ["apodization", "ramp_kernel"]
 Floats = NDArray[np.float64]
 
 _STANDARD = (1.0, 0.9338, 0.7441, 0.4425, 0.0531)
+"""CatSim's kernel of that name, at 0, ¼, ½, ¾ and 1 of the Nyquist frequency."""
 _BONE = (1.0, 1.0485, 1.17, 1.2202, 0.9201)
+"""The same."""
 _POINTS: dict[str, tuple[float, ...]] = {
     "soft": (1.0, 0.815, 0.4564, 0.1636, 0.0),
     "standard": _STANDARD,
@@ -35,6 +37,7 @@ _POINTS: dict[str, tuple[float, ...]] = {
     "bone": _BONE,
     "ram-lak": (1.0, 1.0, 1.0, 1.0, 1.0),
 }
+"""Kernel → its window at the five frequencies."""
 
 
 def _points(kernel: object) -> tuple[float, ...]:

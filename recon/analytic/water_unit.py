@@ -55,6 +55,7 @@ _ALIKE = 0.7
 """Share of a row's highest line integral that the rows beside it show, too. Of what is thinner than
 a row no thickness is known."""
 _MOST_CELLS = 128
+"""Cells of a row, joined, from which its image is made."""
 
 
 def unit_warnings(lines: Tensor, geometry: Geometry, mu_water: float) -> list[str]:

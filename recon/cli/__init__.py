@@ -70,6 +70,7 @@ _GROUPS = {
     "measure": (add_evaluate, add_recovery, add_show_task, add_plaque),
     "studies": (add_compare, add_dose_factor, add_hardcases, add_study, add_verify),
 }
+"""Commands as the help lists them."""
 _BEGIN = """\
 torchpcct {version}: simulate a photon-counting CT scan, reconstruct it,
 measure how much dose a method really saves.
@@ -86,6 +87,7 @@ Your own method          torchpcct evaluate --task nodule --method mylab.nets:re
 
 torchpcct --help says what each command does; torchpcct COMMAND --help has its options and examples.
 """
+"""What ``torchpcct`` alone prints."""
 
 
 def _parser() -> tuple[Parser, Commands, str]:

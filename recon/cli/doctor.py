@@ -37,12 +37,14 @@ for name in sys.argv[1:]:
         said = (str(error).strip().splitlines() or [type(error).__name__])[0]
     print("LOADED", name, said, flush=True)
 """
+"""Program that says of each module whether it can be imported."""
 _CHECKED_ON = (
     "GPU kernels: checked by Triton's interpreter, not yet timed on a card "
     "(tests/bench/gpu.py does)"
 )
 """What is known of the kernels for cards."""
 _AGAIN = "install torchpcct again, in its folder: pip install --force-reinstall --no-deps ."
+"""Remedy of a broken installation."""
 
 
 def _versions() -> str:
@@ -248,6 +250,7 @@ _CHECKS: dict[str, Callable[[], str]] = {
     "adjoint": _adjoint,
     "FBP": _disc,
 }
+"""What is looked at, in this order: a check says what it finds, and raises what is wrong."""
 
 
 def outcomes() -> Iterator[tuple[str, bool, str]]:

@@ -454,9 +454,11 @@ methods: fbp:KERNEL, pwls, mbir, mbir:fidelity=1, mbir:weights=FILE, mbir:vessel
          summed with the weights that show the contrast best (task, iodine or two materials A/B)
 
 """
+"""What the help says of methods."""
 
 
 REALISATIONS = {"low": 8, "high": MANY}
+"""Limits of numbers of noise realisations."""
 
 
 def add_evaluate(commands: Commands) -> None:

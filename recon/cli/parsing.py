@@ -52,6 +52,7 @@ EXPOSURE: Limits = {"positive": True, "high": 1e6, "unit": "s"}
 PLACE: Limits = {"low": -1e12, "high": 1e12, "unit": "mm"}
 """Limits of positions, as of lengths."""
 FORCE = ("--force", bool, None, "replace a file that another command or software has made")
+"""Option of all commands that write."""
 
 
 class _Help(argparse.HelpFormatter):
@@ -128,6 +129,7 @@ _HINTS = {
     "scan": " (torchpcct simulate makes scans)",
     "config": " (torchpcct show-config prints an example)",
 }
+"""Where a missing file may come from, by the argument's name."""
 
 
 def is_path(action: argparse.Action) -> bool:
@@ -265,6 +267,7 @@ _VALUES = re.compile(
     rf"[A-Za-z_][\w.]*\({_in_brackets(4)}\)"
     r"""|(?<![\w=])'[^']*'(?!\w)|(?<![\w=])"[^"]*"(?!\w)"""  # what the user gave
 )
+"""Values in a message, which are no names of arguments."""
 
 
 def as_options(text: str, actions: Sequence[argparse.Action]) -> str:

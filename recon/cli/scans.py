@@ -200,6 +200,7 @@ _OUTPUT = (
     ("--dry-run", bool, None, "print the plan, memory and time; compute nothing"),
     ("--json", bool, None, "print the whole summary as JSON"),
 )
+"""Options of commands that make scans."""
 
 
 def add_simulate(commands: Commands) -> None:
@@ -408,6 +409,7 @@ _READ_WITH = (
     "variable",
     "spot",
 )
+"""Options that a scan's file is read with."""
 
 
 def reader_options(arguments: argparse.Namespace) -> dict[str, Any]:

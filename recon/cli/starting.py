@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 
 _DEMO_VIEWS = 984
+"""Views of the demonstration's scan: half of the scanner's."""
 
 
 # --- demo -----------------------------------------------------------------------------------------

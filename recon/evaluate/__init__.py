@@ -66,6 +66,7 @@ _SOURCES = {
     "recon.evaluate.without_truth": ("evaluate_scans", "evaluate_volumes"),
     "recon.filters": ("deepinv_denoiser",),
 }
+"""Where the names of the package come from, at their first use."""
 
 
 def __getattr__(name: str) -> object:

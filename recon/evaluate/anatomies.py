@@ -162,6 +162,7 @@ _PLAQUE = Plaque(
     cap_thickness=0.3,
     core_semi_axes=(0.5, 0.9, 1.1),
 )
+"""Plaque of the anatomies that differ elsewhere, mm."""
 
 
 def _tube(

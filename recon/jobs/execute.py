@@ -74,8 +74,10 @@ _NO_WORKER_S = 30.0
 _LAST_S = 5.0
 """For processes that are told to end."""
 _SAFE_PATH = "PYTHONSAFEPATH"
+"""Environment variable by which Python leaves the current folder out of its path."""
 
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
+"""Errors of a disk that is full, read-only or broken."""
 
 Progress = Callable[[str, float], None]
 

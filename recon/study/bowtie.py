@@ -101,8 +101,11 @@ _RECORDS = {
 """What factors are measured by → record, the power of it that is proportional to dose, and the
 dose factor's record."""
 _KEYS = ("value", "low", "high")
+"""Of a record: a figure and its interval."""
 _ROI_RADIUS_MM = 50.0
+"""Radius of the region of interest within which the ROI bowtie is open."""
 _COLOURS = dict(zip(BOWTIES, ("tab:blue", "tab:orange"), strict=True))
+"""Of the charts."""
 
 
 @dataclass(frozen=True)

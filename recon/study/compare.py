@@ -41,7 +41,9 @@ SCREEN = "compare_screen"
 rest is."""
 
 _LOW_S = paper.DOSES["1x"]
+"""The paper's lowest exposure, s."""
 _HIGH_S = paper.DOSES["5.7x"]
+"""The paper's highest exposure, s."""
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,7 @@ _SUB_RAYS = 16
 """Beam samples of path lengths."""
 
 KERNEL = "standard"
+"""Kernel of FBP."""
 _PURE = 0.99
 """Share of a tissue in the voxels that its mean is taken over."""
 

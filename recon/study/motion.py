@@ -69,7 +69,9 @@ _DICE = 0.5
 specks do not."""
 
 _PWLS_TOLERANCE_HU = 2.0
-_ERROR_WIDTH_HU = 200.0  # of the window of the error maps, about 0 HU, as in the paper
+"""Distance to the minimum up to which PWLS iterates."""
+_ERROR_WIDTH_HU = 200.0
+"""Window of the error maps, about 0 HU, as in the paper."""
 
 Key = tuple[str, float | None, bool]
 """Method, error of the estimated motion (0: the true one; None: the still vessel), whether there

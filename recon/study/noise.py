@@ -64,8 +64,11 @@ _SQUARES = 4
 readings pin the variance of an ROI mean down to some 0.1 %, which a few hundred ROI means do not.
 """
 _TEN = paper.REALIZATIONS
+"""Realisations of the paper's tables."""
 _BOOTSTRAP = 40_000
-_IMAGES_SCALE = 0.62  # noise does not compress: twenty panels stay below 400 kB at this size
+"""Resamplings of intervals that hold for all pairs of settings together."""
+_IMAGES_SCALE = 0.62
+"""Of the pictures: noise does not compress; twenty panels stay below 400 kB at this size."""
 
 
 @dataclass(frozen=True)

@@ -50,10 +50,14 @@ _BLOOD_HU = (400.0, 600.0)
 _FAT_HU = (-130.0, -85.0)
 """Accepted CT numbers of fat, HU."""
 
-_SHOWN_KEV = 64.0  # of the picture: there the soft tissues have the paper's CT numbers
+_SHOWN_KEV = 64.0
+"""Energy of the picture: there the soft tissues have the paper's CT numbers."""
 _PIXEL_MM = 0.02
+"""Pixel of the picture."""
 _HALF_MM = 2.75
+"""Half of its width."""
 _MARGIN_MM = 0.1
+"""Beyond the bodies that are measured on voxels."""
 
 
 @dataclass(frozen=True)

@@ -75,9 +75,13 @@ _MIDDLE_SLICES = 21
 """Slices of such scans."""
 
 _WIRE_RADIUS_MM = 0.03
+"""Radius of the wire that resolution is measured on; its width is taken off."""
 _WIRE_PIXEL_MM = 0.02
+"""Pixel of its image."""
 _WIRE_PIXELS = 121
+"""Along the edge of its image."""
 _WIRE_ROWS = 4
+"""Detector rows of its scan."""
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,13 @@ from torchpcct.validate import shaped
 Floats = NDArray[np.float64]
 
 CENTRE = slice(0, 3)
+"""Columns of a shape: its centre in the vessel's coordinates, mm."""
 AXES = slice(3, 6)
+"""Logarithms of the semi-axes in mm."""
 TURN = 6
+"""Turn about the vessel, rad."""
 CAP = 7
+"""Logarithm of the cap's thickness in mm."""
 
 
 @dataclass(frozen=True)

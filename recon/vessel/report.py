@@ -29,6 +29,7 @@ _COLOURS = {
     "calcification": "white",
     "second core": "lime",
 }
+"""Of the outlines in the picture."""
 
 
 Deviations = Mapping[str, Mapping[str, float]]

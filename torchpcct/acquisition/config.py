@@ -68,11 +68,16 @@ region: null                # grid to keep, such as
   # {shape: {z: 40, y: 90, x: 90}, spacing: 0.2, center: {z: 0, y: 20, x: 40}}
 tolerance_hu: 0.5           # effects below it are left out
 """
+"""Configuration that ``torchpcct show-config`` prints and ``torchpcct simulate`` takes."""
 
 _SHAPES: dict[str, type[Shape]] = {"cylinder": EllipticCylinder, "ellipsoid": Ellipsoid, "box": Box}
+"""Shapes of a body by their names in a file."""
 _PRESETS: dict[str, Callable[..., Scanner]] = {"pcct": presets.pcct, "eid": presets.eid}
+"""Scanners by their names in a file."""
 _GRID = ("shape", "spacing", "center")
+"""Fields of ``region``."""
 _KEYS = ("scene", "scanner", "exposure_s", "seed", "region", "tolerance_hu")
+"""Fields of a configuration."""
 
 
 @dataclass(frozen=True)

@@ -32,11 +32,13 @@ if TYPE_CHECKING:
 __all__ = ["Plan", "make_plan"]
 
 _PROBE_VIEWS = 6
+"""Views of the scans that a plan is made by."""
 _PROBE_ROWS = 3
-# Sub-rays of the runs that weigh the effects, and of the one that a smaller number of sub-rays must
-# reproduce.
+"""Their rows, those in the middle of what is read."""
 _EFFECT_SUB_RAYS = 32
+"""Sub-rays of the runs that weigh the effects."""
 _TARGET_SUB_RAYS = 256
+"""Sub-rays of the run that a smaller number of them must reproduce."""
 _PEAK_ERROR = 1e-3
 """Rms error of the line integrals by the finite number of sub-rays, relative to the inset's highest
 one."""
@@ -55,6 +57,7 @@ _LEFT_OUT = (
         "counting silicon has no afterglow; tungsten foils part the columns",
     ),
 )
+"""Effects that no scan has, and why."""
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,11 @@ from torchpcct.scene.materials import material
 from torchpcct.validate import choice, number, reals
 
 _KEYS = ("name", "geometry", "source", "detector", "filters", "bowtie", "energy_bin_kev")
+"""Fields of ``scanner``."""
 _DETECTORS = {"silicon": SiliconDetector, "scintillator": Scintillator}
+"""Detectors by ``kind``."""
 _BOWTIE = ("material", "fan_angles_deg", "thickness_mm")
+"""Fields of ``bowtie``."""
 
 
 def scanner_of(values: object, folder: Path = Path()) -> Scanner:

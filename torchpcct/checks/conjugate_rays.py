@@ -299,6 +299,7 @@ def _roll_text(size: float, error: float) -> str:
 
 
 _TEXTS = {"centre": _centre_text, "scale": _scale_text, "step": _step_text, "roll": _roll_text}
+"""What is said of each error of a geometry."""
 
 
 def _mismatch_text(mismatch: float, strangers: bool, mirrored: bool) -> str:

@@ -37,8 +37,8 @@ GAIN_ERROR = 0.1
 the calibration in air of a good detector leaves 0.001."""
 _NEIGHBOURS = 4
 """Cells on either side whose median a cell is compared with."""
-# Share of single lost readings from which zeros up to three wide are taken for lost, too.
 _FREQUENT = 0.005
+"""Share of single lost readings from which zeros up to three wide are taken for lost, too."""
 _SIGMAS = 8.0
 """Standard errors from which a deviation is none of chance."""
 _TOGETHER = 2

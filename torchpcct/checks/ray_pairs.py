@@ -29,9 +29,9 @@ _MOST = 500_000
 """Readings whose conjugates are looked up; more only cost time."""
 _SMALL = 60_000
 """Readings of a scan whose pairs are kept, in 5 MB."""
-# Views beside a conjugate angle that are farther apart than so many usual steps do not stand for
-# it.
 _GAP_STEPS = 3.0
+"""Views beside a conjugate angle that are farther apart than so many usual steps do not stand for
+it."""
 _ROWS = 9
 """Most rows over which slopes are smoothed."""
 _FLAT_CELLS = 2.0

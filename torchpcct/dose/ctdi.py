@@ -32,7 +32,9 @@ __all__ = ["CtdiDose", "ctdi_dose"]
 Floats = NDArray[np.float64]
 
 _SAMPLES = 60
+"""Points of a disc over which a dose is averaged."""
 _PIXEL_MM = 1.0
+"""Pixel of the dose map that the simulated chamber is read from."""
 
 
 @dataclass(frozen=True)

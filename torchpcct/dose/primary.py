@@ -46,9 +46,13 @@ __all__ = ["primary_dose"]
 Floats = NDArray[np.float64]
 
 QUANTITIES = ("absorbed", "interacted")
+"""What is deposited where a photon interacts: the energy that is absorbed, or all that it had."""
 _AXIAL = ("plane", "contiguous")
+"""Single beam in one plane, or contiguous rotations."""
 _FAN_NODES = 1025
+"""Fan angles at which the spectrum behind the bowtie is tabulated."""
 _GROUP_KEV = 3.0
+"""Width of the energy groups."""
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

@@ -54,10 +54,15 @@ PHANTOM_LENGTH_MM = 150.0
 scan, none here."""
 
 _CUTOFF_KEV = 5.0
+"""Energy at which a photon is absorbed where it is: in water its range is below a millimetre."""
 _TABLE_STEP_KEV = 0.5
+"""Step of the tables of cross sections."""
 _FAN_NODES = 1024
+"""Directions of the fan that photons start in."""
 _FORM_NODES = 600
-_FORM_END = 16.0  # Å⁻¹: sin(θ/2) / λ of 198 keV
+"""Nodes of the tables of form factors, denser towards 0."""
+_FORM_END = 16.0
+"""Their end in Å⁻¹: sin(θ/2) / λ of 198 keV."""
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,7 @@ _MARKS = (
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
+"""Byte order marks that a text may begin with, and its encoding."""
 
 
 @contextmanager

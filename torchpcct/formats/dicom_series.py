@@ -333,6 +333,7 @@ def _hounsfield(d: pydicom.Dataset, unit: str | None, ours: bool) -> tuple[Float
 
 
 _KNOWN = "; if you know that they are, Volume.load(..., unit='HU') reads them"
+"""Remedy that refusals of series without HU end with."""
 
 
 def _check_ct(d: pydicom.Dataset) -> None:

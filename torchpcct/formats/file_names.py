@@ -17,6 +17,7 @@ _DECIMAL = re.compile(r"(?:(?<![0-9A-Za-z])-)?\d+(?:\.\d+)?")
 _CHAIN = re.compile(r"\d+\.\d+\.\d+")
 """Sections, dates or identifiers rather than decimals."""
 _SHOWN = 4
+"""File names that a message lists at most."""
 
 
 def matching(pattern: str, folder: Path) -> list[Path]:

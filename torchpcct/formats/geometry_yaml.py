@@ -64,19 +64,26 @@ _OWN = {
     "fan": {"sod", "sdd", "columns", "pitch", "offset", "detector"},
     "cone": {"sod", "sdd", "columns", "rows", "pitch", "offset", "detector"},
 }
+"""Fields of each kind of beam besides ``angles_deg`` and ``pose``."""
 _KINDS: dict[str, Callable[..., Beam]] = {
     "parallel": ParallelBeam,
     "fan": FanBeam,
     "cone": ConeBeam,
 }
+"""Beams by ``kind``."""
 _VECTORS = {
     "vectors": {"vectors", "columns", "rows", "parallel"},
     "rtk": {"file", "columns", "rows", "pitch", "origin"},
 }
+"""Fields of geometries given view by view."""
 _OPTIONAL = {"offset", "detector", "parallel", "origin"}
+"""Fields with a default."""
 _TURNED = ("roll_deg", "tilt_deg", "slant_deg")
+"""Fields of ``pose``: turns of the detector."""
 _SHIFTED = ("columns", "rows")
+"""Shifts of the detector, mm."""
 _HELIX = ("feed", "start")
+"""Travel of the table."""
 
 
 def geometry_of(values: object, folder: Path = Path()) -> Geometry:

@@ -14,6 +14,7 @@ _MOST_LINKS = 16
 _DEEPEST = 16
 """Groups in groups of our own files."""
 _REMEDY = "copy all into one file first (h5copy, h5repack), or open the file that it names"
+"""Of a file that names others."""
 
 
 def inside(file: h5py.Group, name: str, links: int = 0) -> Any:

@@ -53,10 +53,15 @@ class _Reader(NamedTuple):
 
 
 _COUNTS = {"gain", "flux", "dead", "electronic_noise", "linearisation", "exposure_s"}
+"""Options of readers of counts."""
 _LINES = {"dead", "linearisation", "exposure_s"}
+"""Of readers of line integrals."""
 _FRAMES = {"air", "dark"}
+"""Frames that may be given in place of the file's."""
 _HDF5 = (".h5", ".hdf5", ".hdf", ".nxs", ".nx5", ".nx")
+"""Endings of HDF5 files."""
 _CATSIM = (".prep", ".scan")
+"""Of CatSim's files."""
 
 
 def _any(path: Path) -> bool:

@@ -49,6 +49,7 @@ geometry:
   offset: [0, 0.25]         # mm, of the detector's middle; optional
   detector: flat            # or curved
 """
+"""Description of a stack, for the command line's help and the documentation."""
 
 _COUNTS = {
     "air",
@@ -61,8 +62,11 @@ _COUNTS = {
     "mu_water",
     "exposure_s",
 }
+"""Fields of a description of counts."""
 _LINES = {"photons", "dead", "linearisation", "mu_water", "exposure_s"}
+"""Of line integrals."""
 _FILES = {"air", "dark", "dead", "flux", "photons"}
+"""Fields that may name a file."""
 
 
 def _is_name(value: object) -> bool:

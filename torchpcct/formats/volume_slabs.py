@@ -43,6 +43,7 @@ SLAB_ENDINGS = (".nii", ".zarr")
 CHUNK = 32
 """Most slices of a Zarr chunk: slabs hold whole chunks, so that none is written twice."""
 _CHUNK_PLANE = 256
+"""Edge of a Zarr chunk in a slice, voxels."""
 
 
 def check_slab_name(path: str | os.PathLike[str]) -> None:
@@ -233,7 +234,9 @@ def _about(unit: str, report: object = None) -> dict[str, object]:
 
 
 _DIGEST = "torchpcct-sha256:{}"
+"""Checksum of a volume's metadata as it stands in them."""
 _DIGESTS = re.compile(rb"torchpcct-sha256:([0-9a-f]{64})")
+"""The same, to find it."""
 
 
 def _metadata_digest(path: Path) -> tuple[bytes, list[bytes]]:
@@ -294,6 +297,7 @@ def write_ome_zarr(
 
 
 _OWN_FILES = re.compile(r"zarr\.json|0/zarr\.json|0/c(/\d+)+")
+"""Files of an OME-Zarr volume as this module writes them."""
 
 
 def _require_own(path: str | os.PathLike[str]) -> None:

@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, stats
 
-from torchpcct.metrics.half_split import HalfSplit
+from torchpcct.metrics.half_split import AGREE, HalfSplit
 from torchpcct.metrics.intervals import Estimate
 from torchpcct.validate import checked
 
@@ -51,9 +51,6 @@ __all__ = ["EqualNoise", "noise_at_equal_resolution"]
 
 Floats = NDArray[np.float64]
 
-_AGREE = 0.143
-"""Correlation at which two half volumes are as good as one volume of a correlation of 0.5 with
-the truth."""
 _CHANCE = 5.0
 """Standard deviations of a correlation by chance beyond which it counts."""
 _RINGS = 0.15
@@ -243,7 +240,7 @@ class _Match:
         agree = self.cells.sums(hats[0] * hats[1]) / power
         # Fisher's z, which also holds of few samples that agree well.
         z = np.arctanh(np.clip(agree, 0.0, 1.0 - 1e-12)) * np.sqrt(np.maximum(number - 2.0, 0.0))
-        known = (agree > _AGREE) & (z > _CHANCE)
+        known = (agree > AGREE) & (z > _CHANCE)
         known[0, 0] = False  # the mean, which any offset changes
         self.known = known
         self.shared = self.cells.spread(known)

@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 __all__ = ["HalfSplit", "half_split"]
 
 Floats = NDArray[np.float64]
-_AGREE = 0.143
+AGREE = 0.143
+"""Correlation down to which two halves agree: there their mean correlates by ½ with
+what a scan without noise shows (Rosenthal and Henderson, J. Mol. Biol. 333 (2003) 721)."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ class HalfSplit:
             _rings(part) for part in ((a * b.conj()).real, a.abs() ** 2, b.abs() ** 2)
         )
         correlation = cross / (one * two).sqrt().clamp(min=1e-300)
-        below = torch.nonzero(correlation < _AGREE)
+        below = torch.nonzero(correlation < AGREE)
         rings = int(below[0]) if below.numel() else correlation.numel()
         return rings / (min(a.shape[-2:]) * grid_spacing)
 

@@ -34,7 +34,10 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 _RATIO = 1.4
+"""Of the widths of neighbouring channels: α of the dense difference-of-Gaussians channels of Abbey
+and Barrett, J. Opt. Soc. Am. A 18 (2001) 473."""
 _WIDTH = 1.67
+"""Of a channel's wider Gaussian over its narrower one: Q of the same."""
 
 
 @checked

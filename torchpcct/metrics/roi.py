@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 __all__ = ["RoiMean"]
 
 PROTOCOL_PIXEL_MM = 0.035
+"""Edge of a pixel of the protocol's axial image, mm (Li et al.)."""
 PROTOCOL_PIXELS = 256
+"""Pixels along its edge."""
 
 
 def as_array(image: object) -> Any:

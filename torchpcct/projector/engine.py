@@ -29,6 +29,7 @@ _CHECKED: dict[tuple[str, torch.dtype], float] = {}
 ENGINES: weakref.WeakValueDictionary[int, Engine] = weakref.WeakValueDictionary()
 """Engines by their handles: what a traced graph can hold, which holds tensors and numbers only."""
 _HANDLES = itertools.count()
+"""Those that were given out."""
 
 
 class _CpuPasses(Protocol):
@@ -180,7 +181,9 @@ class Engine:
 
 
 _ANGLES = np.array([0.1, 1.9, 4.0])
+"""Views in rad of the small scans that compile the kernels."""
 _PLANE = VolumeGrid((9, 8), 2.0, (1.0, -2.0))
+"""Their grid in the plane."""
 _SMALL: dict[type[Geometry], tuple[Geometry, VolumeGrid]] = {
     ParallelBeam: (ParallelBeam(_ANGLES, 15, 1.9), _PLANE),
     FanBeam: (FanBeam(_ANGLES, 60.0, 110.0, 21, 2.1), _PLANE),
@@ -189,3 +192,4 @@ _SMALL: dict[type[Geometry], tuple[Geometry, VolumeGrid]] = {
         VolumeGrid((5, 7, 6), (1.5, 2.0, 2.2), (0.4, 1.0, -2.0)),
     ),
 }
+"""A small scan of each kind of beam."""

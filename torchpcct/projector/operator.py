@@ -33,7 +33,9 @@ __all__ = ["Operator", "Projector"]
 
 Linear = Callable[[Tensor], Tensor]
 _DTYPES = (torch.float32, torch.float64)
+"""Precisions in which passes are computed."""
 _NARROW = (torch.float16, torch.bfloat16)
+"""Precisions that are widened to float32 before."""
 
 
 class Operator(nn.Module):

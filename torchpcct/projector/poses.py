@@ -40,6 +40,7 @@ PARAMETERS: Mapping[str, str] = {
 }
 """What :func:`with_parameters` takes, and its unit."""
 _TURNS = ("slant", "tilt", "roll")
+"""Turns of the detector, in the order in which they are carried out."""
 
 
 class ParametricGeometry:

@@ -12,8 +12,10 @@ from torchpcct.validate import checked
 Floats = NDArray[np.float64]
 
 ELECTRON_REST_KEV = 510.99895
+"""Rest energy of the electron (CODATA 2018)."""
 
 _NODES = 96
+"""Scattering angles of the quadrature."""
 
 
 @functools.cache

@@ -55,6 +55,7 @@ SCINTILLATOR_NOISE_KEV = 206.0
 electrons per keV (public CatSim/XCIST default)."""
 
 _MODES = ("counting", "spectral")
+"""What a detector reads: one number a reading, or one a bin."""
 
 
 def _halves(nodes: int) -> tuple[Floats, Floats]:
@@ -65,6 +66,7 @@ def _halves(nodes: int) -> tuple[Floats, Floats]:
 
 
 _PARTS = _halves(24)
+"""Parts of a charge that two cells share, and their weights."""
 
 
 @runtime_checkable

@@ -38,6 +38,7 @@ at its word."""
 THICKEST_MM = 400.0
 """Of the water in the calibration."""
 _SAMPLES = 400
+"""Thicknesses of water in the calibration."""
 
 
 @dataclass(frozen=True, eq=False)

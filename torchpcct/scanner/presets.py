@@ -39,8 +39,10 @@ FLAT_FILTER_MM = 3.0
 """Assumed flat aluminium filter in front of the tube (public CatSim/XCIST default)."""
 
 QUARTER_OFFSET_COLUMNS = 0.25
+"""Offset of the detector by which opposite views interleave."""
 
 _BOWTIES = ("large", "roi", "large+roi", "none")
+"""Bowties of the presets."""
 
 
 def _bowties(name: object, sod: float) -> tuple[Bowtie, ...]:

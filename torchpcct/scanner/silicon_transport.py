@@ -36,7 +36,9 @@ _MOST_INTERACTIONS = 20
 """A photon is dropped after so many."""
 
 _HEIGHT_KEV = 0.1
+"""Step of pulse heights."""
 _HEIGHTS = np.arange(0.5 * _HEIGHT_KEV, _NODES_KEV[-1] + 1.0, _HEIGHT_KEV)
+"""Pulse heights at which further counts are tabulated, keV."""
 
 
 @dataclass(frozen=True)

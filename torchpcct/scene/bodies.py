@@ -27,9 +27,10 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
-# Where the surface of an infinite shape is sampled to: far beyond any scanner (mm).
 FAR = 2000.0
+"""Where the surface of an infinite shape is sampled to, mm: far beyond any scanner."""
 _ORTHOGONAL = 1e-9
+"""Deviation of m mᵀ from the identity up to which m is a rotation."""
 
 
 @checked

@@ -50,17 +50,19 @@ ENERGY_RANGE_KEV = (1.0, 500.0)
 800 keV."""
 
 _KINDS = ("total", "photo", "incoh", "coh")
+"""Cross sections: all together, photoelectric, incoherent (Compton), coherent (Rayleigh)."""
 
 
-# Symbols of the elements in the cross-section table (Z = 1…98), written out so that building a
-# material needs no table.
 _SYMBOLS = (
     "H He Li Be B C N O F Ne Na Mg Al Si P S Cl Ar K Ca Sc Ti V Cr Mn Fe Co Ni Cu Zn Ga Ge As Se "
     "Br Kr Rb Sr Y Zr Nb Mo Tc Ru Rh Pd Ag Cd In Sn Sb Te I Xe Cs Ba La Ce Pr Nd Pm Sm Eu Gd Tb "
     "Dy Ho Er Tm Yb Lu Hf Ta W Re Os Ir Pt Au Hg Tl Pb Bi Po At Rn Fr Ra Ac Th Pa U Np Pu Am Cm "
     "Bk Cf"
 )
+"""Elements in the cross-section table, Z = 1…98, written out so that building a material needs no
+table."""
 _ELEMENTS = frozenset(_SYMBOLS.split())
+"""The same, to look them up."""
 
 
 @functools.lru_cache(maxsize=4096)
@@ -479,6 +481,7 @@ PLAQUE_MATERIALS = (
 
 
 _CONCENTRATION = re.compile(r"(\w+) +([0-9.eE+-]+) *mg/m[lL] +in +(\w+)")
+"""``iodine 10 mg/mL in blood``."""
 
 
 def material(value: Material | str) -> Material:

@@ -30,6 +30,7 @@ _SINGULAR = 1e-5
 below 0."""
 
 VMI_ENERGIES_KEV = tuple(float(e) for e in range(40, 141))
+"""Energies of the paper's virtual monochromatic images."""
 
 
 @checked

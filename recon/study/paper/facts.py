@@ -158,3 +158,4 @@ PHANTOM_MM: Mapping[str, float] = {
 """Phantom: lengths in mm. The paper draws it on binary voxels of 0.021 mm."""
 
 PHANTOM_VOXEL_MM = 0.021
+"""Edge of its voxels."""

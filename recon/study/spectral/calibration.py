@@ -30,6 +30,7 @@ SHOWN_KEV = (52.0, 70.0)
 """Energies at which wrong calibrations are compared: the paper's best, and one where contrasts
 are usual."""
 _PURE = 0.999
+"""Volume fraction of blood in the voxels that count as lumen."""
 
 
 @dataclass(frozen=True)

@@ -63,11 +63,13 @@ judges by eye."""
 
 LOW_EXPOSURE_S = 0.35
 """The paper's shortest exposure: the decomposition must hold there, too."""
-_LOW_EXPOSURE_STEP = 8  # views between those that are looked at there
+_LOW_EXPOSURE_STEP = 8
+"""Views between those that are looked at there."""
 
-# the paper's: blood green, core red, fibrous blue, fat dark
 _COLOURS = ("#2ca02c", "#d62728", "#1f77b4", "#202020")
+"""The paper's colours of tissues: blood green, core red, fibrous blue, fat dark."""
 _PICTURED_KEV = (40.0, 52.0, 70.0)
+"""Energies of the monochromatic images that are shown."""
 
 
 @dataclass(frozen=True)

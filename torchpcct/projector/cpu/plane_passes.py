@@ -24,10 +24,13 @@ from torchpcct.projector.tables import Tables
 from torchpcct.threads import run
 
 _WIDTHS = (1, 2, 4, 8)
-# Lanes whose positions spread over this many voxels at most reach two, or three, intervals between
-# knots.
+"""Numbers of lanes of a vector register that the kernels are compiled for; a lane holds an image or
+one of its symmetric copies."""
 _NEAR = 1.0
+"""Voxels over which the positions of lanes spread at most where they reach two intervals between
+knots."""
 _FAR = 2.0
+"""Where they reach three."""
 
 
 class _LaneTables:

@@ -20,6 +20,7 @@ from torchpcct.projector.rays import Rays
 
 Ints = NDArray[np.int64]
 _TURNS = [(m, 0) for m in range(4)]
+"""Quarter turns, without reflection: (turns, reflected)."""
 _SETS = (
     _TURNS + [(m, 1) for m in range(4)],
     _TURNS,
@@ -30,12 +31,16 @@ _SETS = (
     [(0, 0), (0, 1)],
     [(0, 0)],
 )
-# Relative time of one pass with that many lanes (a vector of 8 float32 is one register), at the
-# same place and apart.
+"""Groups of turns and reflections of the grid that lanes are made of, the largest first."""
 _COST = {1: 1.0, 2: 1.2, 4: 1.3, 8: 1.5}
+"""Lanes → time of a pass over that with one lane (a vector of 8 float32 is one register), measured
+with lanes at the same place."""
 _COST_APART = {2: 2.6, 4: 2.8, 8: 3.2}
-_TOLERANCE = 1e-9  # rad
-_SAME_PLACE = 1e-12  # voxels; rounding of the centre
+"""The same of lanes at different places."""
+_TOLERANCE = 1e-9
+"""Difference in rad of angles that are the same."""
+_SAME_PLACE = 1e-12
+"""Voxels; rounding of the centre."""
 
 
 @dataclass(frozen=True, eq=False)

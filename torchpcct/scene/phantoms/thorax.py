@@ -36,7 +36,9 @@ RIB_ANGLES_DEG = (-58.0, -31.0, -2.0, 27.0, 54.0)
 the side."""
 
 _HEART_TILT = math.radians(-22.0)
-_WALL = (145.0, 93.5, 2.0)  # ellipse on which the ribs lie: semi-axes, y of its centre
+"""Turn of the heart about z, rad."""
+_WALL = (145.0, 93.5, 2.0)
+"""Ellipse on which the ribs lie: semi-axes and y of its centre, mm."""
 
 _ELLIPSES: tuple[
     tuple[str, tuple[float, float], tuple[float, float], float, str, str | None], ...

@@ -33,10 +33,11 @@ from torchpcct.validate import checked, number, numbers
 
 __all__ = ["PAPER_POSITION", "PATIENT_DIAMETER", "Plaque", "interpolate_material", "plaque_scene"]
 
-# Default of ``Plaque.position``: the centre in the authors' published phantom description, 42.44 mm
-# off the isocentre.
 PAPER_POSITION = (-29.63, -30.38, 0.0)
+"""Default of ``Plaque.position``, x, y, z in mm: the centre in the authors' published phantom
+description, 42.44 mm off the isocentre."""
 PATIENT_DIAMETER = 240.0
+"""Diameter of the paper's patient, mm."""
 
 
 @dataclass(frozen=True)
