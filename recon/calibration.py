@@ -23,7 +23,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -277,7 +277,7 @@ class _Problem:
     """The readings of a scan, and what volumes on a grid leave of them."""
 
     def __init__(self, scan: Scan, grid: VolumeGrid, names: list[str]) -> None:
-        geometry: Any = scan.geometry
+        geometry = scan.geometry
         if scan.window is not None:
             raise ValueError(
                 "calibration needs the whole detector; this scan keeps a part of it (a window)"

@@ -150,7 +150,7 @@ def loaded(spec: str) -> Callable[..., object]:
     """
     module, _, name = spec.partition(":")
     try:
-        found: Any = importlib.import_module(module)
+        found: object = importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
     except Exception as error:  # whatever a foreign module does when it is imported

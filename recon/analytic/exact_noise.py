@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -39,6 +40,21 @@ __all__ = [
 FILTER_MARGIN_COLUMNS = 32
 """Columns on either side of the footprint whose noise is counted. The filter's tail falls as 1 /
 n², its square as 1 / n⁴: what lies beyond adds less than 1e-4 to the variance of an ROI mean."""
+
+
+class HasWeights(Protocol):
+    """A linear functional of a volume, such as :class:`torchpcct.metrics.roi.RoiMean`."""
+
+    @property
+    def weights(self) -> Tensor:
+        """Of its voxels, the shape of its grid."""
+        ...
+
+
+class Functional(NamedTuple):
+    """The sum of a volume with any weights."""
+
+    weights: Tensor
 
 
 @checked
@@ -128,7 +144,7 @@ def roi_adjoints(clean: Scan, fbp: InsetFbp, rois: Sequence[Sequence[RoiMean]]) 
 
 @checked
 def roi_covariance(
-    clean: Scan, fbp: InsetFbp, rois: Sequence[Sequence[RoiMean]], exposure_s: float
+    clean: Scan, fbp: InsetFbp, rois: Sequence[Sequence[HasWeights]], exposure_s: float
 ) -> list[NDArray[np.float64]]:
     """Covariance of ROI means in HU² for every grid and kernel of ``fbp``.
 
@@ -232,7 +248,9 @@ def voxel_covariance(clean: Scan, fbp: InsetFbp, exposure_s: float, voxel: Seque
         return reconstruct(h * variance)
 
 
-def _traces(fbp: InsetFbp, grid: int, rois: Sequence[RoiMean], clean: Scan) -> tuple[int, Tensor]:
+def _traces(
+    fbp: InsetFbp, grid: int, rois: Sequence[HasWeights], clean: Scan
+) -> tuple[int, Tensor]:
     """Transposed backprojection of ROI weights on one of the grids: first detector row, ``(rois,
     views, rows, columns)`` of those seen.
 

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import torch
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from torchpcct.typing import Floats32
 
 Floats = NDArray[np.float64]
+Piece: TypeAlias = dict[str, Any]
+"""What is kept of some realisations: numbers and arrays by the names that :class:`Readings` has."""
 
 BLOCK = 8
 """Realisations of a piece."""
@@ -290,16 +292,16 @@ class Measurement:
     ) -> None:
         self.method, self.reader, self.store = method, reader, realisations.store
         self._place, self._key = kept_as(method, exposure_s, realisations.task, realisations.seed)
-        self._pieces: list[dict[str, Any]] = []
+        self._pieces: list[Piece] = []
 
-        def clean() -> dict[str, Any]:
+        def clean() -> Piece:
             pair = [realisations.noise_free(p, exposure_s) for p in (True, False)]
             return _measure_pairs(
                 [pair], method, reader, keep=True, fbp=pair[0].fbp(realisations.kernels[0])
             )
 
         self._clean = self.store.piece(f"{self._place}/clean", self._key, clean)
-        self._known: dict[str, Any] | None = None
+        self._known: Piece | None = None
         self._adjoints: Tensor | None = None
         if method.network is not None:
             respond = partial(realisations.response, method.network, reader, exposure_s)
@@ -309,7 +311,7 @@ class Measurement:
     def block(self, k: range, pairs: Callable[[], Sequence[Sequence[Simulated]]]) -> None:
         """Realisations ``k``; ``pairs`` gives them, if they have not been measured before."""
 
-        def compute() -> dict[str, Any]:
+        def compute() -> Piece:
             return _measure_pairs(
                 pairs(), self.method, self.reader, keep=k.start == 0, adjoints=self._adjoints
             )
@@ -356,7 +358,7 @@ def _measure_pairs(
     keep: bool,
     adjoints: Tensor | None = None,
     fbp: Tensor | None = None,
-) -> dict[str, Any]:
+) -> Piece:
     """A piece of pairs; with ``fbp``, which then is that of the first realisation, the first volume
     is checked against it."""
     lists: dict[str, list[Any]] = {

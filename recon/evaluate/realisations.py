@@ -13,15 +13,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, cached_property, partial
-from types import SimpleNamespace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from recon.analytic.exact_noise import roi_covariance
+from recon.analytic.exact_noise import Functional, roi_covariance
 from recon.analytic.inset import InsetFbp
 from recon.data_term import Quadratic
 from recon.evaluate.methods import Method, noise_of
@@ -112,9 +111,7 @@ class Realisations:
         """Of the ROI means of FBP at 1 s, kernel → ``(rois, 2, rois, 2)`` HU²; it falls as 1 /
         exposure."""
         regions, key = self.task.regions, self.key
-        functionals: list[Any] = [
-            SimpleNamespace(weights=w) for pair in regions.values() for w in pair
-        ]
+        functionals = [Functional(w) for pair in regions.values() for w in pair]
 
         @cache
         def together() -> dict[str, NDArray[np.float64]]:

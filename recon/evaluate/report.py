@@ -82,7 +82,7 @@ def plain(records: Iterable[Mapping[str, object]]) -> list[dict[str, object]]:
     ]
 
 
-def filled(template: Path, data: Mapping[str, Any]) -> str:
+def filled(template: Path, data: Mapping[str, object]) -> str:
     """A template's text with the values of ``data``, see :func:`templates`.
 
     Raises:
@@ -125,8 +125,8 @@ def templates(folder: Path) -> Environment:
     return made
 
 
-def _figure(value: Any, spec: str) -> str:
-    value = value["value"] if isinstance(value, Mapping) else value
+def _figure(found: float | Mapping[str, float | None] | None, spec: str) -> str:
+    value = found["value"] if isinstance(found, Mapping) else found
     return "–" if value is None or math.isnan(value) else format(value, spec)
 
 
@@ -146,7 +146,7 @@ def _rounded(r: Record) -> str:
     return _interval(r, f".{min(digits + (1 if size < 10 and r['unit'] == '' else 0), 3)}f")
 
 
-def _row(rows: list[Record], **wanted: Any) -> Record:
+def _row(rows: list[Record], **wanted: object) -> Record:
     fits = [r for r in rows if wanted.items() <= r.items()]
     if len(fits) != 1:
         raise ValueError(f"{len(fits)} rows have {wanted}: exactly one must")
@@ -223,7 +223,7 @@ def write_report(
     title: str,
     text: str,
     values: str,
-    figures: Mapping[str, Any],
+    figures: Mapping[str, Figure],
     more: Mapping[str, bytes] | None = None,
 ) -> list[Path]:
     """Write a report into ``folder`` (made if need be), each file whole.

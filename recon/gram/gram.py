@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -402,10 +402,9 @@ def information_at(
         mu_per_hu: 1 HU in mm⁻¹.
     """
     hy, hx = spacing[-2:]
-    double: Any = {"dtype": torch.float64, "device": spectra.device}
     f = torch.hypot(
-        torch.fft.fftfreq(period[0], hy, **double)[:, None],
-        torch.fft.rfftfreq(period[1], hx, **double)[None, :],
+        torch.fft.fftfreq(period[0], hy, dtype=torch.float64, device=spectra.device)[:, None],
+        torch.fft.rfftfreq(period[1], hx, dtype=torch.float64, device=spectra.device)[None, :],
     )
     spectra = spectra.double()
     wanted = min(frequency, HIGHEST_PER_VOXEL / max(hy, hx))

@@ -56,6 +56,7 @@ from torchpcct.kernel_cache import compiled_once
 from torchpcct.validate import whole
 
 if TYPE_CHECKING:
+    from multiprocessing.process import BaseProcess
     from types import FrameType, TracebackType
 
 
@@ -323,14 +324,14 @@ def _begin_process(safe_path: str | None) -> None:
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), on_signal)
     # A process whose parent was killed would wait for its next job forever.
-    parent: Any = multiprocessing.parent_process()
-
-    def end() -> None:
-        parent.join()
-        os._exit(1)
-
+    parent = multiprocessing.parent_process()
     if parent is not None:
-        threading.Thread(target=end, daemon=True).start()
+        threading.Thread(target=_end_after, args=(parent,), daemon=True).start()
+
+
+def _end_after(parent: BaseProcess) -> None:
+    parent.join()
+    os._exit(1)
 
 
 class Cluster(Executor):

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
@@ -76,7 +76,7 @@ class CompareSettings(StudySettings):
     energies_views: int = VIEWS
 
     # An eighth of the views, 8 realisations, no PWLS: some minutes on two slow cores.
-    QUICK: ClassVar[Mapping[str, Any]] = {
+    QUICK: ClassVar[Mapping[str, object]] = {
         "views": 246,
         "n": 8,
         "energies_views": 48,
@@ -131,7 +131,7 @@ def claim(records: list[JsonObject]) -> JsonObject | None:
         two was not measured.
     """
 
-    def found(method: str, exposure_s: float, figure: str) -> Any:
+    def found(method: str, exposure_s: float, figure: str) -> JsonObject | None:
         wanted = {"method": method, "exposure_s": exposure_s, "figure": figure, "where": "small"}
         return next((r for r in records if wanted.items() <= r.items()), None)
 

@@ -11,14 +11,13 @@ contrast over variance with that of the plain sum.
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from recon.analytic.exact_noise import functional_covariance, roi_covariance
+from recon.analytic.exact_noise import Functional, functional_covariance, roi_covariance
 from recon.analytic.inset import InsetFbp
 from recon.evaluate.energies import mean_paths, with_bins
 from recon.evaluate.task import Task
@@ -175,7 +174,7 @@ def _signal_to_noise(
     at 1 s of the functional of FBP."""
     hu = 1000.0 / scan.linearisation.mu_ref
     contrast = hu * float(_per_mm(scan.line_integrals() - other.line_integrals(), path))
-    roi: Any = SimpleNamespace(weights=functional)
+    roi = Functional(functional)
     fbp = InsetFbp(scan, [task.grid], [kernel])
     (covariance,) = roi_covariance(scan, fbp, [[roi]], NOISE_FREE_EXPOSURE_S)
     return contrast**2 / float(covariance[0, 0, 0])

@@ -155,15 +155,15 @@ def read_dicom_ct_pd(
     """
     paths = dicom_files(folder)
     views: list[_View] = []
-    first: dict[str, Any] = {}
+    first: _Detector | None = None
     for path in paths:
         with reading(path, "a DICOM-CT-PD projection"):
             file = open_dicom(path)
             detector = _detector(file)
-            if not first:
+            if first is None:
                 first = detector
                 size = sum(p.stat().st_size for p in paths)
-                check_expansion((len(paths), first["rows"], first["columns"]), "the scan", size)
+                check_expansion((len(paths), first.rows, first.columns), "the scan", size)
             elif detector != first:
                 raise ValueError("its detector differs from that of the first file")
             angle, height, radius = (
@@ -179,8 +179,9 @@ def read_dicom_ct_pd(
             photons = np.asarray(_value(file, "photons", np.zeros(0)), dtype=np.float64)
     views.sort(key=lambda v: v.number)
     _check_complete(folder, np.array([v.number for v in views]))
+    assert first is not None  # dicom_files gives at least one
     g = first
-    views, shift = _from_one_spot(folder, views, g["spot"], ignore_flying_spot, spot)
+    views, shift = _from_one_spot(folder, views, g.spot, ignore_flying_spot, spot)
     radii = np.array([v.radius for v in views])
     if np.ptp(radii) > 1e-3 * radii.mean():
         raise ValueError(
@@ -194,11 +195,11 @@ def read_dicom_ct_pd(
     geometry = ConeBeam(
         angles,
         float(radii.mean()),
-        g["sdd"],
-        g["columns"],
-        g["rows"],
-        (g["row_pitch"], g["pitch"]),
-        g["offset"],
+        g.sdd,
+        g.columns,
+        g.rows,
+        (g.row_pitch, g.pitch),
+        g.offset,
         "curved",
     )
     if any(shift):
@@ -207,18 +208,18 @@ def read_dicom_ct_pd(
     if np.ptp(heights) > _TURN_MM:
         motion = np.zeros((len(views), 3))
         motion[:, 0] = heights[0] - heights
-    water = float(g["water"]) if g["water"] else None
+    water = float(g.water) if g.water else None
     info: dict[str, object] = {
         "file": str(folder),
         "format": "DICOM-CT-PD",
-        "flying_focal_spot": g["spot"],
+        "flying_focal_spot": g.spot,
     }
     if any(shift):
         info["focal_spot_shift"] = dict(
             zip(("angle_rad", "height_mm", "radius_mm"), shift, strict=True)
         )
     lines = torch.from_numpy(np.stack([v.lines for v in views]))
-    use = photons if photons.size == g["columns"] and (photons > 0).all() else None
+    use = photons if photons.size == g.columns and (photons > 0).all() else None
     return ClinicalProjections(
         lines, geometry, motion, water, None if use is None else use[::-1].copy(), info
     )
@@ -324,7 +325,20 @@ def _seen_from(at_rest: ConeBeam, angle: float, height: float, radius: float) ->
     )
 
 
-def _detector(file: pydicom.Dataset) -> dict[str, Any]:
+class _Detector(NamedTuple):
+    """Of one projection; lengths in mm, ``offset`` as (row, column), ``water`` in mm⁻¹."""
+
+    rows: int
+    columns: int
+    pitch: float
+    row_pitch: float
+    sdd: float
+    spot: str
+    offset: tuple[float, float]
+    water: float
+
+
+def _detector(file: pydicom.Dataset) -> _Detector:
     shape = _value(file, "shape").upper()
     if shape != "CYLINDRICAL":
         raise ValueError(f"its detector is {shape or 'unknown'}: only cylindrical ones are read")
@@ -332,22 +346,22 @@ def _detector(file: pydicom.Dataset) -> dict[str, Any]:
     rows, columns = int(_value(file, "rows")[0]), int(_value(file, "columns")[0])
     pitch, row_pitch = float(_value(file, "spacing")[0]), float(_value(file, "row_spacing")[0])
     column, row = (float(c) for c in _value(file, "centre")[:2])  # counted from 1
-    return {
-        "rows": rows,
-        "columns": columns,
-        "pitch": pitch,
-        "row_pitch": row_pitch,
-        "sdd": float(_value(file, "distance")[0]),
-        "spot": spot,
-        "offset": (((rows + 1) / 2 - row) * row_pitch, (column - (columns + 1) / 2) * pitch),
-        "water": float(_value(file, "water", np.zeros(1))[0]),
-    }
+    return _Detector(
+        rows,
+        columns,
+        pitch,
+        row_pitch,
+        sdd=float(_value(file, "distance")[0]),
+        spot=spot,
+        offset=(((rows + 1) / 2 - row) * row_pitch, (column - (columns + 1) / 2) * pitch),
+        water=float(_value(file, "water", np.zeros(1))[0]),
+    )
 
 
-def _pixels(file: pydicom.Dataset, g: dict[str, Any]) -> Floats32:
+def _pixels(file: pydicom.Dataset, g: _Detector) -> Floats32:
     """``(rows, columns)`` float32, columns in our direction."""
     stored = np.asarray(file.pixel_array, dtype=np.float32)
-    shape = (g["columns"], g["rows"])  # the files count channels as image rows
+    shape = (g.columns, g.rows)  # the files count channels as image rows
     if stored.shape == shape:
         stored = stored.T
     elif stored.shape != shape[::-1]:

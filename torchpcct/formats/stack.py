@@ -127,14 +127,15 @@ def read_stack(
     }
     if "dead" in options:
         options["dead"] = np.asarray(options["dead"]).astype(bool)
-    info: dict[str, Any] = {"file": str(path), "format": "stack"}
+    info: dict[str, object] = {"file": str(path), "format": "stack"}
     views, beam = geometry.views, geometry
+    kept: list[int] = []
 
     def pick(shape: tuple[int, ...]) -> tuple[slice, ...]:
         axis = slice_axis(beam, shape)
         axis = 1 if shape[0] == views else axis  # images of a camera, view by view
-        info["slices"] = sliced(beam, slices, shape[axis])[1]  # type: ignore[arg-type]
-        return tuple(slice(*info["slices"][:2]) if k == axis else slice(None) for k in range(3))
+        kept[:] = sliced(beam, slices, shape[axis])[1]  # type: ignore[arg-type]
+        return tuple(slice(*kept[:2]) if k == axis else slice(None) for k in range(3))
 
     readings = read_array(name, folder, None if slices is None else pick)
     if kind == "counts":
@@ -148,7 +149,7 @@ def read_stack(
     if not geometry.has_rows and readings.ndim == 3 and readings.shape[0] == geometry.views:
         readings = np.moveaxis(readings, 0, 1)
     if slices is not None:
-        first, stop, count = info["slices"]
+        first, stop, count = info["slices"] = kept
         geometry = sliced(geometry, slices, count)[0]
         for key in _FILES & set(options):
             # One value a cell, (…, slices, columns), or one a reading of a stack, (slices, views,

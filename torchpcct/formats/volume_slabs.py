@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     import zarr
     from numpy.typing import ArrayLike
 
-    from torchpcct.typing import Floats32, Reals
+    from torchpcct.typing import Floats32, JsonObject, Reals
 
 
 SLAB_ENDINGS = (".nii", ".zarr")
@@ -99,7 +99,7 @@ class SlabFile:
         _require_own(self.path)
         resumed = self.part.exists() and kept.get("key") == key
         self.done: int = kept["done"] if resumed else 0
-        self.notes: dict[str, Any] = kept["notes"] if resumed else {}
+        self.notes: JsonObject = kept["notes"] if resumed else {}
         if not resumed:
             with self._writing():
                 self.discard()
@@ -149,7 +149,7 @@ class SlabFile:
             os.replace(self.part, self.path)
             self.journal.unlink(missing_ok=True)
 
-    def _kept(self) -> dict[str, Any]:
+    def _kept(self) -> JsonObject:
         """What the journal says; empty if there is none, or that is a file of somebody else."""
         try:
             kept = json.loads(self.journal.read_text(encoding="utf-8"))

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -45,6 +45,10 @@ _SAME_AIR = 1e-3
 """Relative difference of the air readings of one scanner, of float32 and of interpolated maps."""
 _SAMPLES = 400
 """Water thicknesses at which pile-up is known for the water correction."""
+
+
+Behind: TypeAlias = Mapping[str, float] | Mapping[Material, float] | Mapping[Material | str, float]
+"""Materials that the rays cross, or their names → thickness in mm."""
 
 
 class BinWeights(np.ndarray[tuple[int, int], np.dtype[np.float64]]):
@@ -85,7 +89,7 @@ class BinWeights(np.ndarray[tuple[int, int], np.dtype[np.float64]]):
 def bin_weights(
     scanner: Scanner,
     contrast: Sequence[Material | str],
-    behind: Mapping[Any, float] | None = None,
+    behind: Behind | None = None,
 ) -> BinWeights:
     """Weights of the energy bins that show a small contrast best, column by column.
 
@@ -114,7 +118,7 @@ def bin_weights(
 def weighting_gain(
     scanner: Scanner,
     contrast: Sequence[Material | str],
-    behind: Mapping[Any, float] | None = None,
+    behind: Behind | None = None,
     weights: object = "bins",
 ) -> Floats:
     """What weights bring: squared signal-to-noise ratio of a small contrast over that of the summed
@@ -150,7 +154,7 @@ def weighting_gain(
 def contrast_information(
     scanner: Scanner,
     contrast: Sequence[Material | str],
-    behind: Mapping[Any, float] | None = None,
+    behind: Behind | None = None,
     weights: object = "bins",
 ) -> Floats:
     """Squared signal-to-noise ratio of a small contrast that is larger than a cell, per mm² of its
@@ -197,7 +201,7 @@ def contrast_information(
 def _photons(
     scanner: Scanner,
     contrast: Sequence[Material | str],
-    behind: Mapping[Any, float] | None,
+    behind: Behind | None,
 ) -> tuple[Floats, Floats, tuple[str, ...], dict[str, float]]:
     """Photons ``(bins, columns, E)`` that are counted behind the materials, the contrast ``(E,)``
     in mm⁻¹, and the names."""
