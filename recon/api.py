@@ -218,7 +218,7 @@ def reconstruct(
         _LOG.warning("%s", text)
     methods: dict[str, Any] = {"fbp": _fbp, "pwls": reconstruct_pwls, "mbir": _mbir}
     volumes: list[Volume] = []
-    told: set[str] = set()
+    logged: set[str] = set()
     began = time.perf_counter()
     found_of = methods[name](scans, grid, progress or (lambda _: None), **chosen)
     for batch in _within_memory(found_of, there):
@@ -235,9 +235,9 @@ def reconstruct(
                 report |= {"device": str(there), "on_cpu": _on_cpu(name, s, report)}
             report["warnings"] = [*before, *found]
             for text in found:
-                if text not in told:
+                if text not in logged:
                     _LOG.warning("%s", text)
-            told.update(found)
+            logged.update(found)
             volumes.append(Volume(volume, grid, report, unit=s.unit))
         began = time.perf_counter()
     return volumes[0] if isinstance(scan, Scan) else volumes
@@ -269,10 +269,10 @@ def _within_memory(batches: Iterator[T], device: torch.device) -> Iterator[T]:
     try:
         yield from batches
     except torch.OutOfMemoryError as error:
-        said = str(error).partition(". ")[0]
+        reason = str(error).partition(". ")[0]
         raise ValueError(
-            f"{device} has too little memory ({said}): take larger or fewer voxels, fewer volumes "
-            'at a time, or device="cpu"'
+            f"{device} has too little memory ({reason}): take larger or fewer voxels, fewer "
+            'volumes at a time, or device="cpu"'
         ) from error
 
 

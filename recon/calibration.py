@@ -387,10 +387,10 @@ class _Problem:
         inverse = np.linalg.pinv(unit, rcond=1e-8, hermitian=True) / np.outer(scaled, scaled)
         step = inverse @ _products(own * w, rest)[:, 0]
         # Noise of the step: the readings' noise, of which a volume has explained a part, blurred.
-        heard = self._blurred(own * w)
+        noisy = self._blurred(own * w)
         if errors:  # of what was heard, a volume has explained a part
-            heard = left(heard * variance * known) * w
-        noise = inverse @ _products(heard * variance, heard) @ inverse
+            noisy = left(noisy * variance * known) * w
+        noise = inverse @ _products(noisy * variance, noisy) @ inverse
         spread = np.sqrt(np.maximum(np.diag(noise), 0.0))
         if np.linalg.matrix_rank(unit, tol=1e-6, hermitian=True) < len(unit):
             spread = np.full(len(unit), math.inf)

@@ -154,13 +154,13 @@ def loaded(spec: str) -> Callable[..., object]:
         for part in name.split("."):
             found = getattr(found, part)
     except Exception as error:  # whatever a foreign module does when it is imported
-        said = (
+        reason = (
             str(error)
             if isinstance(error, ImportError | AttributeError)
             else f"{type(error).__name__}: {error}"
         )
         raise ValueError(
-            f"cannot load {spec!r}: {said} (is its folder on PYTHONPATH?){meant_method(module)}"
+            f"cannot load {spec!r}: {reason} (is its folder on PYTHONPATH?){meant_method(module)}"
         ) from error
     if not callable(found):
         raise TypeError(f"{spec} is no function")

@@ -40,7 +40,7 @@ class Result(NamedTuple):
     tests: Sequence[ResidualTest] = ()
 
 
-def tested(name: str, said: list[str], test: Callable[..., T], *args: object) -> list[T]:
+def tested(name: str, warnings: list[str], test: Callable[..., T], *args: object) -> list[T]:
     """What a test of a finished volume finds. A test that fails must not lose the volume: it
     becomes a warning.
 
@@ -56,7 +56,7 @@ def tested(name: str, said: list[str], test: Callable[..., T], *args: object) ->
         return [test(*args)]
     except Exception as error:
         _LOG.debug("%s failed", name, exc_info=True)
-        said.append(
+        warnings.append(
             f"{name} failed ({type(error).__name__}: {error}), so the volume is not tested by it"
         )
         return []

@@ -167,8 +167,8 @@ class ScanSlices:
         start, _, self.count = info["slices"]
         g = self.first.geometry
         self.geometry: Geometry = g.with_rows(-start, self.count)
-        lead = () if g.has_rows else (self.count,)
-        self.counts = torch.empty((*lead, *self.geometry.shape), device="meta")
+        stack = () if g.has_rows else (self.count,)
+        self.counts = torch.empty((*stack, *self.geometry.shape), device="meta")
 
     def __getstate__(self) -> dict[str, object]:
         """For another process, which reads slabs: the file by its full path, no readings."""
@@ -671,11 +671,11 @@ def _as_jobs(
         done.add(job.args[2:])
         while waiting and waiting[0] in done:
             first, stop = waiting.popleft()
-            piece = _slab_piece(folder, maker, key, first, stop)
+            block = _slab_piece(folder, maker, key, first, stop)
             keep(
                 stop,
-                piece["values"],
-                dict(zip(piece["texts"].tolist(), piece["peaks"].tolist(), strict=True)),
+                block["values"],
+                dict(zip(block["texts"].tolist(), block["peaks"].tolist(), strict=True)),
             )
             Store(folder).remove(folder / f"{first}-{stop}.npz")
 

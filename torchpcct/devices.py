@@ -24,9 +24,9 @@ def device_of(device: object) -> torch.device:
         # What is made there says which one it is, and that there is one.
         return torch.empty(0, device=device).device
     except (RuntimeError, AssertionError, NotImplementedError) as error:
-        said = str(error).partition("\n")[0].rstrip(".")
+        reason = str(error).partition("\n")[0].rstrip(".")
         raise ValueError(
-            f'there is no device {str(device)!r} here that torch can use ({said}): use "cpu"'
+            f'there is no device {str(device)!r} here that torch can use ({reason}): use "cpu"'
         ) from None
 
 

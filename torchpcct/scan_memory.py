@@ -63,8 +63,8 @@ def _state(scan: Scan) -> Hashable:
     """Tells readings that were changed in place: by torch, which counts its changes, or through
     memory that is shared with NumPy, by a sum of each view's bits."""
     tensors = [(name, getattr(scan, name)) for name in _TENSORS]
-    told = [(name, id(t), t._version) for name, t in tensors if isinstance(t, Tensor)]
-    return (*told, _bits(scan.counts), _bits(scan.air), len(scan.info))
+    key = [(name, id(t), t._version) for name, t in tensors if isinstance(t, Tensor)]
+    return (*key, _bits(scan.counts), _bits(scan.air), len(scan.info))
 
 
 def _bits(values: Tensor) -> Hashable:

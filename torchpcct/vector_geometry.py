@@ -219,8 +219,8 @@ class VectorGeometry(Geometry):
         normal = np.cross(u, v)
         way = ((centre - source) * normal).sum(1) / (ray * normal).sum(1)
         along = self.poses[:, axis]
-        beside = centre - source - way[:, None] * ray
-        return np.asarray((beside * along).sum(1) / np.linalg.norm(along, axis=1))
+        offset = centre - source - way[:, None] * ray
+        return np.asarray((offset * along).sum(1) / np.linalg.norm(along, axis=1))
 
     @property
     def magnification(self) -> float:

@@ -175,8 +175,8 @@ class Volume:
                 "DICOM": read_dicom,
                 "OME-Zarr": read_ome_zarr,
             }[form]
-            values, grid, said = read(path, unit)
-            return cls(torch.from_numpy(values), grid, {"file": str(path)}, said)
+            values, grid, stored = read(path, unit)
+            return cls(torch.from_numpy(values), grid, {"file": str(path)}, stored)
         with read_hdf5(path, "volume") as file:
             held = file["data"]
             check_expansion(held.shape, "the volume", held.id.get_storage_size, held.dtype.itemsize)
@@ -186,11 +186,11 @@ class Volume:
                 tuple(file.attrs["spacing_mm"]),
                 tuple(file.attrs["center_mm"]),
             )
-            said = str(file.attrs["unit"])
-            if unit not in (None, said):
-                raise ValueError(f"it gives the unit {said!r}, not {unit!r}")
+            stored = str(file.attrs["unit"])
+            if unit not in (None, stored):
+                raise ValueError(f"it gives the unit {stored!r}, not {unit!r}")
             report = json.loads(file.attrs["report"])
             report |= {
                 name: torch.from_numpy(values[()]) for name, values in file.get("maps", {}).items()
             }
-            return cls(data, grid, report, said)
+            return cls(data, grid, report, stored)

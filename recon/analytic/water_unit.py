@@ -109,8 +109,8 @@ def _row(darkest: NDArray[np.float64]) -> int | None:
     none."""
     if len(darkest) == 1:
         return 0
-    beside = np.minimum(darkest[:-2], darkest[2:])
-    alike = np.flatnonzero(beside > _ALIKE * darkest[1:-1]) + 1
+    neighbours = np.minimum(darkest[:-2], darkest[2:])
+    alike = np.flatnonzero(neighbours > _ALIKE * darkest[1:-1]) + 1
     return int(alike[np.argmax(darkest[alike])]) if alike.size else None
 
 

@@ -117,9 +117,11 @@ def _faults(names: list[str]) -> dict[str, str]:
         done = subprocess.run(
             [sys.executable, "-P", "-c", _LOAD, *left], capture_output=True, text=True, check=False
         )
-        told = dict(re.findall(r"^LOADED (\S+) (.*)$", done.stdout, re.MULTILINE))
-        faults |= {modules[name]: said for name, said in told.items() if said != "loads"}
-        left = [name for name in left if name not in told]
+        outcomes = dict(re.findall(r"^LOADED (\S+) (.*)$", done.stdout, re.MULTILINE))
+        faults |= {
+            modules[name]: outcome for name, outcome in outcomes.items() if outcome != "loads"
+        }
+        left = [name for name in left if name not in outcomes]
         if left:  # it ended at the first of them
             faults[modules[left.pop(0)]] = f"it ends the process, status {done.returncode}"
     return faults
@@ -138,9 +140,9 @@ def _threads() -> str:
     from torchpcct.threads import get_num_threads
 
     names = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OMP_WAIT_POLICY")
-    said = ", ".join(f"{n}={os.environ[n]}" for n in names if n in os.environ)
+    settings = ", ".join(f"{n}={os.environ[n]}" for n in names if n in os.environ)
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    used = f"torch {torch.get_num_threads()}, kernels {get_num_threads()}; {said}"
+    used = f"torch {torch.get_num_threads()}, kernels {get_num_threads()}; {settings}"
     return f"{usable} of {os.cpu_count()} cores usable, {used}"
 
 

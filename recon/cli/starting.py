@@ -137,9 +137,9 @@ def _doctor(arguments: argparse.Namespace, progress: ProgressBars) -> int:
     from recon.cli.doctor import outcomes  # loads all that it looks at
 
     broken = 0
-    for name, well, said in outcomes():
+    for name, well, text in outcomes():
         broken += not well
-        print(f"{'ok    ' if well else 'BROKEN'}  {name:<13} {said}", flush=True)
+        print(f"{'ok    ' if well else 'BROKEN'}  {name:<13} {text}", flush=True)
     print(
         "all is well"
         if not broken

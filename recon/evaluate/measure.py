@@ -388,8 +388,8 @@ def _measure_pairs(
                 check_volume(volumes[0], method, reader, fbp)
         lists["rois"].append([reader.pair(v) for v in volumes])
         for name in ("drawn", "warned"):
-            said = [getattr(realisation, name, None) for realisation in pair]
-            lists[name].append([math.nan if answer is None else float(answer) for answer in said])
+            answers = [getattr(realisation, name, None) for realisation in pair]
+            lists[name].append([math.nan if a is None else float(a) for a in answers])
         if adjoints is not None:
             control.append([functionals(adjoints, realisation.term.b[0]) for realisation in pair])
         for o in OBSERVERS:

@@ -71,7 +71,7 @@ _ANSWER_S = 8.0
 _AGAIN_S = 0.5
 """Until a scheduler is asked a second time for a job that it does not know."""
 _NO_WORKER_S = 30.0
-"""Until it is said that a cluster has no worker."""
+"""Until a cluster without workers is reported."""
 _LAST_S = 5.0
 """For processes that are told to end."""
 _SAFE_PATH = "PYTHONSAFEPATH"
@@ -150,14 +150,14 @@ class _Run:
 
 @dataclass
 class _Done:
-    """What comes back: ``said`` is what was logged as a warning."""
+    """What comes back: ``messages`` are what was logged as warnings."""
 
     where: str
     value: object = None
     files: dict[str, bytes] = field(default_factory=dict)
     seconds: float = 0.0
     compiled_s: float = 0.0
-    said: list[str] = field(default_factory=list)
+    messages: list[str] = field(default_factory=list)
 
 
 # --- where jobs are run ---------------------------------------------------------------------------
@@ -522,11 +522,11 @@ def _compiling(own: bool) -> Iterator[Callable[[], float]]:
 def captured_warnings(*loggers: str, alone: bool = False) -> Iterator[list[str]]:
     """The warnings that loggers are given meanwhile; ``""`` is the root. ``alone``: nobody else
     hears them."""
-    said: list[str] = []
+    messages: list[str] = []
 
     class Listener(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
-            said.append(record.getMessage())
+            messages.append(record.getMessage())
 
     listener, watched = Listener(logging.WARNING), [logging.getLogger(name) for name in loggers]
     before = [logger.propagate for logger in watched]
@@ -534,7 +534,7 @@ def captured_warnings(*loggers: str, alone: bool = False) -> Iterator[list[str]]
         logger.addHandler(listener)
         logger.propagate = logger.propagate and not alone
     try:
-        yield said
+        yield messages
     finally:
         for logger, propagate in zip(watched, before, strict=True):
             logger.removeHandler(listener)
@@ -581,7 +581,7 @@ def _do_job(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # What a worker logs the client says instead; of its own process it has heard it.
-        with _compiling(own) as compiled, captured_warnings(*([] if own else [""])) as said:
+        with _compiling(own) as compiled, captured_warnings(*([] if own else [""])) as messages:
             value = function(folder, *args)
     except OSError as error:
         if scratch is None or (error.errno not in _DISK and not isinstance(error, WriteError)):
@@ -596,7 +596,7 @@ def _do_job(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _
             for p in folder.glob(pattern)
         }
     )
-    return _Done(where, value, made, time.perf_counter() - start, compiled(), said)
+    return _Done(where, value, made, time.perf_counter() - start, compiled(), messages)
 
 
 # --- the client -----------------------------------------------------------------------------------
@@ -693,7 +693,7 @@ def _run(
     folder: Path,
     executor: Executor,
     of: _Run,
-    book: _Log,
+    run_log: _Log,
     progress: Progress | None,
     finished: Callable[[Job], object] | None,
 ) -> dict[str, Any]:
@@ -706,7 +706,7 @@ def _run(
     ready = deque(job for job in jobs if not needs[job.name])
     values, lost, deaths = dict[str, Any](), dict[str, str](), Counter[str]()
     running: dict[Future[_Done], Job] = {}
-    said: set[str] = set()
+    messages: set[str] = set()
 
     def leave_out(job: Job, why: str) -> None:
         if lost.setdefault(job.name, why) is why:
@@ -738,13 +738,13 @@ def _run(
                     if not isinstance(executor, Cluster):
                         raise
                     executor.refuse(error)
-                    book.note(f"again    {job.name}: {error}")
+                    run_log.note(f"again    {job.name}: {error}")
                     ready.append(job)
                     continue
                 except Exception as error:
                     why = _death(error, executor)
                     deaths[job.name] += 1
-                    book.note(f"failed   {job.name}: {why}")
+                    run_log.note(f"failed   {job.name}: {why}")
                     if deaths[job.name] < DEATHS and isinstance(executor, Processes):
                         ready.append(job)
                     else:
@@ -752,10 +752,10 @@ def _run(
                     continue
                 _keep(folder, done.files)
                 values[job.name] = done.value
-                book.done(job, done)
-                for text in dict.fromkeys(done.said):
-                    if text not in said:
-                        said.add(text)
+                run_log.done(job, done)
+                for text in dict.fromkeys(done.messages):
+                    if text not in messages:
+                        messages.add(text)
                         log.warning("%s", text)
                 if finished is not None:
                     finished(job)
@@ -766,9 +766,11 @@ def _run(
             if isinstance(executor, Cluster):
                 executor.check()
             if progress is not None:
-                progress(book.text(len(values), len(running), len(lost)), len(values) / len(jobs))
+                progress(
+                    run_log.text(len(values), len(running), len(lost)), len(values) / len(jobs)
+                )
     except KeyboardInterrupt as error:
-        book.note(
+        run_log.note(
             f"ended    {error or 'interrupted'}: {len(values)} of {len(jobs)} jobs are done, and "
             "kept"
         )

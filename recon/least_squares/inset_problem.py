@@ -310,11 +310,11 @@ class InsetProblem:
         terms = [self.term(s, y) for s, y in zip(scans, data, strict=True)]
         found, report = self.solve(Quadratic.joined(terms), prior, **options)
         for scan, lines, values in zip(scans, data, found.to(torch.float32), strict=True):
-            said: list[str] = []
+            warnings: list[str] = []
             tests = (
                 []
                 if scan.noise_free
-                else tested(RESIDUAL_TEST, said, self.residual_test, scan, values, lines)
+                else tested(RESIDUAL_TEST, warnings, self.residual_test, scan, values, lines)
             )
-            yield Result(values, report, said, tests)
+            yield Result(values, report, warnings, tests)
         advance(1.0)

@@ -78,17 +78,17 @@ def reconstruct_pwls(
 
         found = []
         for solution in problem.solutions(part, prior or problem.prior, wanted, advance):
-            said, report = list(problem.warnings), solution.report
+            messages, report = list(problem.warnings), solution.report
             if not report["converged"]:
                 left, asked = (
                     in_words(v, problem.unit, problem.mu_ref)
                     for v in (report["rmsd_hu"][-1], report["tolerance_hu"])
                 )
-                said.append(
+                messages.append(
                     f"PWLS stopped {left} from the minimum after {report['exact_pairs']} "
                     f"projection pairs (tolerance {asked}): raise max_exact, or strengthen the "
                     "prior"
                 )
-                warnings.warn(said[-1], RuntimeWarning, stacklevel=2)
-            found.append(solution._replace(warnings=[*said, *solution.warnings]))
+                warnings.warn(messages[-1], RuntimeWarning, stacklevel=2)
+            found.append(solution._replace(warnings=[*messages, *solution.warnings]))
         yield found

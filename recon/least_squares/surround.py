@@ -99,7 +99,7 @@ class UnknownSurround:
         Raises:
             ValueError: the rows end inside the object.
         """
-        of = _told(lines)
+        of = _fingerprint(lines)
         if self._last is not None and self._last[0] == of:
             return self._last[1]
         if any(cut_off(lines, self.geometry, angular_weights(self.geometry))):
@@ -239,7 +239,7 @@ class _Field:
         return torch.nan_to_num(fbp(extended, self._extended, self.grid, outside=outside))
 
 
-def _told(lines: Tensor) -> Hashable:
+def _fingerprint(lines: Tensor) -> Hashable:
     """What line integrals are told apart by: a hash or, of those on a device, from which nothing
     is to be copied, the sums of the bits of all views."""
     if lines.device.type == "cpu":

@@ -68,13 +68,13 @@ class Inset:
         with torch.no_grad():
             solved = network.solve(term)
         found = []
-        for k, (scan, y, (volume, report, said, _)) in enumerate(
+        for k, (scan, y, (volume, report, before, _)) in enumerate(
             zip(scans, data, solved, strict=True)
         ):
             report["voxel_mm"] = self._work.spacing[-1]
             peak = float(volume.max())
             warnings = [
-                *said,
+                *before,
                 *network.check(report["noise_scale_hu"], peak, scan.unit, problem.mu_ref),
             ]
             tests = []

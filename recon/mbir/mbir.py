@@ -448,9 +448,9 @@ class _Note(NamedTuple):
 
 def _note(known: Known, found: Drawn, why: str) -> _Note:
     """What is to be said of a scan in which something known was to be drawn."""
-    said = {"drawn": False, "why": why} if why else {"drawn": True}
+    entry = {"drawn": False, "why": why} if why else {"drawn": True}
     text = f"no {known.name} was drawn: {why}" if why else known.caution
-    return _Note({**found.report, known.name: said}, [*found.warnings, text])
+    return _Note({**found.report, known.name: entry}, [*found.warnings, text])
 
 
 def _fill(model: Unrolled, tensors: Mapping[str, Tensor]) -> None:

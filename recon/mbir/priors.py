@@ -231,8 +231,8 @@ def network_of(values: Mapping[str, Any], named: object = None) -> nn.Module:
     try:
         made = make(**arguments)
     except TypeError as error:
-        told = ", ".join(f"{k}={v!r}" for k, v in arguments.items()) or "no arguments"
-        raise ValueError(f"{name_of(make)} cannot be made with {told}: {error}") from error
+        given = ", ".join(f"{k}={v!r}" for k, v in arguments.items()) or "no arguments"
+        raise ValueError(f"{name_of(make)} cannot be made with {given}: {error}") from error
     if not isinstance(made, nn.Module):
         raise TypeError(f"{name_of(make)} must make a torch.nn.Module, got {type(made).__name__}")
     return made

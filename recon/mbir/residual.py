@@ -116,13 +116,13 @@ def _significant(step: Tensor, window: Tensor, noise: Tensor) -> Tensor:
             continue
         coefficients, power = _transformed(blocks(z, y)[own], window, noise)
         place = _flat((torch.searchsorted(own, which), *near[pair, 1:].T), power.shape)
-        beside = (
+        largest = (
             torch.zeros_like(power)
             .flatten()
             .scatter_reduce(0, place, of_near[pair], "amax")
             .reshape(power.shape)
         )
-        kept = coefficients * _structure(beside * _beyond(_CONTINUED, power), power)
+        kept = coefficients * _structure(largest * _beyond(_CONTINUED, power), power)
         made = torch.fft.irfftn(kept, s=edges, dim=_AXES) * window
         for k, block in zip(own.tolist(), made, strict=True):
             row(out, z, y)[..., k * hops[2] : k * hops[2] + edges[2]] += block

@@ -191,9 +191,9 @@ def measure(
                 "step_mm": float(np.linalg.norm(np.diff(path, axis=0), axis=1).max()),
                 "plan": dict(moving.info["plan"]),
             }
-            told = partial(progress, "compensation")
+            advance = partial(progress, "compensation")
             m.compensated = compensate(
-                s, still, moving, reference, pieces.within("compensation"), told
+                s, still, moving, reference, pieces.within("compensation"), advance
             )
     data |= {
         "at_rest": {name: o.measures for name, o in m.at_rest.items()},

@@ -79,9 +79,9 @@ def render(root: Path) -> dict[str, str]:
     studies = [study for study in map(registry.folder, registry.STUDIES) if study in found]
     from recon.study.recovery import shown_by_mbir  # loads numba
 
-    beside_weights = {SHOWN: shown_by_mbir(found["recovery"])} if "recovery" in found else {}
+    shown_figures = {SHOWN: shown_by_mbir(found["recovery"])} if "recovery" in found else {}
     return {
-        **beside_weights,
+        **shown_figures,
         **{
             f"notebooks/{study}/report.md": report.render(study, found[study]) + "\n"
             for study in studies

@@ -261,7 +261,7 @@ class CoreSpace:
 
     def target(self, shapes: Floats) -> tuple[Floats, Floats]:
         """Log prior and log evidence of shapes ``(m, 8)``, as
-        :func:`recon.vessel.particles.lead` takes them."""
+        :func:`recon.vessel.particles.sample_towards` takes them."""
         prior = self.log_prior(shapes)
         log = np.zeros(len(shapes))
         allowed = np.isfinite(prior)

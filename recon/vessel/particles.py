@@ -38,7 +38,7 @@ class Cloud(NamedTuple):
     log_evidence: float
 
 
-def lead(
+def sample_towards(
     start: Floats,
     base: Target,
     target: Target,
@@ -46,7 +46,7 @@ def lead(
     *,
     log_evidence: float = 0.0,
 ) -> Cloud:
-    """Lead a cloud from one distribution to another.
+    """Samples of a distribution from those of another (sequential Monte Carlo).
 
     Args:
         start: ``(m, d)`` draws of the first distribution.

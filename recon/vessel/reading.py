@@ -18,7 +18,7 @@ from recon.vessel.core import CorePrior, CoreSpace
 from recon.vessel.data import grid_of, in_hu, pilot
 from recon.vessel.figures import TissueEstimate, draws_of, estimate
 from recon.vessel.model import FIBROUS, Fit, VesselModel
-from recon.vessel.particles import Cloud, lead
+from recon.vessel.particles import Cloud, sample_towards
 from recon.vessel.prior import VesselPrior
 from recon.vessel.quality import STRIKING, Leftover, beside, leftover, misfit, texture
 from recon.vessel.start import find_vessel
@@ -313,7 +313,7 @@ def _calcified(vessel: VesselModel, fit: Fit, particles: int, rng: np.random.Gen
         seen = space.evidence(space.shares(tries))
         if not np.any((seen.log > _LEAST_LOG) & (seen.mean > 0.5 * CALCIFIED_HU)):
             break
-        cloud = lead(tries[:particles], space.nothing, space.target, rng)
+        cloud = sample_towards(tries[:particles], space.nothing, space.target, rng)
         found = space.evidence(space.shares(cloud.points))
         if not (
             found.mean.mean() > 0.5 * CALCIFIED_HU
@@ -379,7 +379,7 @@ def _read(
     calcifications = others - (other_core is not None)
     plain = fit
     space = CoreSpace(vessel, fit, prior_of_core)
-    cloud = lead(space.draw_prior(particles, rng), space.nothing, space.target, rng)
+    cloud = sample_towards(space.draw_prior(particles, rng), space.nothing, space.target, rng)
     first = cloud.log_evidence
     seen = space.evidence(space.shares(cloud.points))
     if seen.mean.mean() > 0.5 * CALCIFIED_HU and others < _MOST_BODIES and not other_core:
@@ -392,7 +392,7 @@ def _read(
     without = CoreSpace(vessel, vessel.fit(fit.parameters, fit.bodies), prior_of_core)
     fit = _with_body(vessel, fit, space, cloud, float(seen.mean.mean()))
     again = CoreSpace(vessel, fit, prior_of_core, replaces=others, against=without.none)
-    cloud = lead(cloud.points, space.target, again.target, rng, log_evidence=first)
+    cloud = sample_towards(cloud.points, space.target, again.target, rng, log_evidence=first)
     space = again
     odds = math.log(prior / (1 - prior)) if 0 < prior < 1 else math.copysign(math.inf, prior - 0.5)
     presence = _probability(cloud.log_evidence + odds)
@@ -437,7 +437,7 @@ def _read(
     )
     if found is not None and other_core is None:
         where, cloud_there, contrast_there = found
-        told = _core_told(where, cloud_there, contrast_there, more)
+        second = _other_core(where, cloud_there, contrast_there, more)
         both = _read(
             vessel,
             _with_body(vessel, plain, where, cloud_there, contrast_there, expected=True),
@@ -446,7 +446,7 @@ def _read(
             prior,
             rng,
             seed,
-            told,
+            second,
         )
         if both.presence >= CERTAIN:
             return both
@@ -477,7 +477,7 @@ def _read(
             "prior": prior,
             "second_core": other_core,
         },
-        third_core=None if found is None else _core_told(*found, more),
+        third_core=None if found is None else _other_core(*found, more),
     )
     why = "" if reading.explained else "the tissues do not explain the data, see the warning"
     doubt = why or _doubt(presence, given["contrast"])
@@ -529,14 +529,14 @@ def _one_more(
     probability = _probability(float(logsumexp(log)) - math.log(len(log)))
     if probability < _WORTH:
         return probability, None
-    cloud = lead(tries[:particles], more.nothing, target, rng)
+    cloud = sample_towards(tries[:particles], more.nothing, target, rng)
     probability = _probability(cloud.log_evidence)
     if probability < CERTAIN:
         return probability, None
     return probability, (more, cloud, float(more.evidence(more.shares(cloud.points)).mean.mean()))
 
 
-def _core_told(space: CoreSpace, cloud: Cloud, contrast: float, probability: float) -> OtherCore:
+def _other_core(space: CoreSpace, cloud: Cloud, contrast: float, probability: float) -> OtherCore:
     """Place, size and value of a core beside the first."""
     seen = space.evidence(space.shares(cloud.points))
     return {

@@ -117,8 +117,8 @@ def table(
 
 def _hidden(reading: PlaqueReading) -> set[str]:
     """Plaque bodies that a reading must not show: fibrous tissue in their place."""
-    told = reading.explained and not reading.taken_off_hu
-    return (set() if told else {"calcification"}) | (
+    trusted = reading.explained and not reading.taken_off_hu
+    return (set() if trusted else {"calcification"}) | (
         set() if reading.certain else {"core", "second core"}
     )
 

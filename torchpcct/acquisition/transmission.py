@@ -392,9 +392,9 @@ def _across(geometry: ConeBeam, focal_width: float, points: Floats) -> Floats:
         u = geometry.sdd * np.sin(u / geometry.sdd)
     else:
         along = np.full_like(u, -geometry.sdd)
-    beside = u - aim[:, :1] * focal_width
-    inverse = 1.0 / np.hypot(along, beside)
-    return np.stack([along * inverse, beside * inverse, inverse], axis=-1)
+    across = u - aim[:, :1] * focal_width
+    inverse = 1.0 / np.hypot(along, across)
+    return np.stack([along * inverse, across * inverse, inverse], axis=-1)
 
 
 def expected_readings(

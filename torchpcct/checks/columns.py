@@ -141,8 +141,8 @@ def _gain(blocks: Floats, g: Geometry) -> tuple[float, str]:
         wrong &= np.abs(mean) > np.where(inside, alike, 0.0)
         # The neighbours of a wrong gain bend by half as much, the other way.
         left, right = (np.roll(mean, k, axis=-1) for k in (width, -width))
-        beside = np.maximum(np.abs(left + mean / 2.0), np.abs(right + mean / 2.0))
-        wrong &= beside < _ALIKE * np.abs(mean)
+        neighbours = np.maximum(np.abs(left + mean / 2.0), np.abs(right + mean / 2.0))
+        wrong &= neighbours < _ALIKE * np.abs(mean)
         wrong[..., :width] = wrong[..., -width:] = False
         if not wrong.any():
             continue

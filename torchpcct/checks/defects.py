@@ -262,7 +262,7 @@ def _dead_cells(sums: NDArray[np.float64], light: float) -> NDArray[np.bool_]:
     dead: NDArray[np.bool_] = used & (dark > 0.98 * seen)
     good_level = np.where(dead | ~used, np.nan, bright / np.maximum(seen, 1))
     # Of a dead row the neighbours are in other rows.
-    dead &= np.fmax(_beside(good_level), _beside(good_level.T).T) > light
+    dead &= np.fmax(_neighbours_median(good_level), _neighbours_median(good_level.T).T) > light
     along = _dimmed(good_level, dead)
     dead &= ~np.where(
         np.isnan(along), np.nan_to_num(_dimmed(good_level.T, dead.T).T), along
@@ -353,7 +353,7 @@ def _mirrored(deviation: NDArray[np.float64], row: int, column: int) -> bool:
     return bool(((alike > _MIRRORED) & (alike < 1.0 / _MIRRORED)).any())
 
 
-def _beside(cells: NDArray[np.float64]) -> NDArray[np.float64]:
+def _neighbours_median(cells: NDArray[np.float64]) -> NDArray[np.float64]:
     """Median of the cells up to four places beside each on the last axis, NaN left out; NaN
     where there is none."""
     padded = np.pad(cells, ((0, 0), (_NEIGHBOURS, _NEIGHBOURS)), constant_values=np.nan)
@@ -521,8 +521,8 @@ def _unshadowed(
             for d in (0, -distance[0, middle], distance[1, middle])
         )
         inside = np.isfinite(own)
-        beside = np.minimum(np.where(left > 0, left, np.inf), np.where(right > 0, right, np.inf))
-        good &= ~inside | (own >= 0.5 * beside)
+        lower = np.minimum(np.where(left > 0, left, np.inf), np.where(right > 0, right, np.inf))
+        good &= ~inside | (own >= 0.5 * lower)
         moved &= _company(n, p, first, step, _WIDTH + moving)
         tested |= inside
     good &= tested & ~moved

@@ -186,9 +186,9 @@ def read_data_exchange(
                 "give air=, the reading without the object"
             )
         if pitch is None:
-            pitch, said = _pixel_size(file)
+            pitch, source = _pixel_size(file)
         else:
-            said = f"given, {pitch} mm"
+            source = f"given, {pitch} mm"
         part = None if slices is None else [*slices.indices(data.shape[1])[:2], data.shape[1]]
         return Frames(
             str(path),
@@ -198,7 +198,7 @@ def read_data_exchange(
             0.0 if frames["dark"] is None else frames["dark"],
             angles,
             pitch,
-            said,
+            source,
             part,
         ).scan(mu_water, **options)
 
@@ -246,16 +246,16 @@ def angles_in(data: h5py.Dataset, views: int, what: str, of: slice | Bools = sli
     if angles.size != views:
         raise ValueError(f"{data.name} has {angles.size} angles, {what} {views} views")
     angles = angles[of]
-    said = next(
+    unit = next(
         (unit_text(data.attrs[name]) for name in ("units", "unit") if name in data.attrs), ""
     )
-    if said:
-        if said not in RAD:
+    if unit:
+        if unit not in RAD:
             raise ValueError(
-                f"its angles, {data.name}, are in {said!r}, which is neither deg nor rad: give "
+                f"its angles, {data.name}, are in {unit!r}, which is neither deg nor rad: give "
                 "angles_deg="
             )
-        return angles * RAD[said]
+        return angles * RAD[unit]
     span = float(np.ptp(angles)) if angles.size else 0.0
     step = span / max(angles.size - 1, 1)
     turns = round((span + 0.5 * step) / math.pi)

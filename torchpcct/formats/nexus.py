@@ -152,11 +152,11 @@ def read_nexus(
             held["air"] if air is not None else _as_long(file, detector, key, held["air"], black)
         )
         size = inside(file, f"{detector}/x_pixel_size")
-        said = "the file does not know its pixel size"
+        source = "the file does not know its pixel size"
         if pitch is not None:
-            said = f"given, {pitch} mm"
+            source = f"given, {pitch} mm"
         elif size is not None:
-            pitch, said = length_in(size)
+            pitch, source = length_in(size)
         part = None if slices is None else [*slices.indices(data.shape[1])[:2], data.shape[1]]
         return Frames(
             str(path),
@@ -166,7 +166,7 @@ def read_nexus(
             black,
             _angles(file, detector, key, angles_deg),
             pitch,
-            said,
+            source,
             part,
         ).scan(mu_water, **options)
 

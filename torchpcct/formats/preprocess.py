@@ -122,8 +122,8 @@ def without_stripes(lines: Tensor, *, snr: float = 3.0) -> Tensor:
             stands = means - median_filter(means, size=(1, 9), mode="nearest")
             stands = median_filter(stands, size=(size, 1), mode="nearest")
             usual = MEDIAN_TO_SD * np.median(np.abs(stands))
-            beside = percentile_filter(np.abs(stands), 80, size=(1, 13), mode="nearest")
-            partial = np.abs(stands) > np.maximum((snr + 1.0) * usual, 3.0 * beside)
+            strong = percentile_filter(np.abs(stands), 80, size=(1, 13), mode="nearest")
+            partial = np.abs(stands) > np.maximum((snr + 1.0) * usual, 3.0 * strong)
             # What moves a median of so many views lasts for half of them.
             partial = binary_opening(partial, np.ones((size // 2, 1)))
             clean[k] = sinogram - np.where(partial, stands, 0.0)[which]

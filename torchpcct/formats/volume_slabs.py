@@ -364,12 +364,12 @@ def read_ome_zarr(
         image = about.get("ome", about)["multiscales"][0]
         array = group[image["datasets"][0]["path"]]
         names = [axis["name"] for axis in image["axes"]]
-        lead = len(names) - 3
-        if names[lead:] != ["z", "y", "x"] or any(n != 1 for n in array.shape[:lead]):
+        leading = len(names) - 3
+        if names[leading:] != ["z", "y", "x"] or any(n != 1 for n in array.shape[:leading]):
             raise ValueError(
                 f"its axes are {', '.join(names)} of {array.shape}, expected one volume of z, y, x"
             )
-        units = [str(axis.get("unit", "millimeter")) for axis in image["axes"][lead:]]
+        units = [str(axis.get("unit", "millimeter")) for axis in image["axes"][leading:]]
         if not set(units) <= set(MM):
             raise ValueError(
                 f"its lengths are in {', '.join(sorted(set(units) - set(MM)))}, which is no known "
@@ -381,22 +381,22 @@ def read_ome_zarr(
         for transforms in (image["datasets"][0], image):  # of the resolution, then of all
             for step in transforms.get("coordinateTransformations", []):
                 if step["type"] == "scale":
-                    factor = np.array(step["scale"][lead:], dtype=np.float64)
+                    factor = np.array(step["scale"][leading:], dtype=np.float64)
                     spacing, first = spacing * factor, first * factor
                 elif step["type"] == "translation":
-                    first = first + np.array(step["translation"][lead:], dtype=np.float64)
+                    first = first + np.array(step["translation"][leading:], dtype=np.float64)
         spacing, first = spacing * lengths, first * lengths
-        shape = tuple(array.shape[lead:])
+        shape = tuple(array.shape[leading:])
         center = first + spacing * (np.array(shape) - 1) / 2
         own = about.get("torchpcct")
-        said = None if own is None else own.get("unit", "HU")
-        if said is not None and said not in UNITS:
-            raise ValueError(f"it gives the unit {said!r}, expected {' or '.join(UNITS)}")
-        if said is not None and unit not in (None, said):
-            raise ValueError(f"it gives the unit {said!r}, not {unit!r}")
+        stored = None if own is None else own.get("unit", "HU")
+        if stored is not None and stored not in UNITS:
+            raise ValueError(f"it gives the unit {stored!r}, expected {' or '.join(UNITS)}")
+        if stored is not None and unit not in (None, stored):
+            raise ValueError(f"it gives the unit {stored!r}, not {unit!r}")
         grid = VolumeGrid(shape, tuple(map(float, spacing)), tuple(map(float, center)))
         data = _chunk_by_chunk(array, Path(path) / image["datasets"][0]["path"], own is not None)
-        return data.reshape(shape), grid, said or unit or "HU"
+        return data.reshape(shape), grid, stored or unit or "HU"
 
 
 def _chunk_by_chunk(array: zarr.Array, folder: Path, whole: bool) -> Floats32:

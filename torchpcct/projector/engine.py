@@ -112,17 +112,17 @@ class Engine:
         """One pass, ``(..., *domain_shape)`` to ``(..., *range_shape)`` or, ``transposed``,
         back; no autograd."""
         inner, outer = self.shapes(transposed)
-        lead = x.shape[: x.dim() - len(inner)]
-        batch = math.prod(lead)
+        batch_shape = x.shape[: x.dim() - len(inner)]
+        batch = math.prod(batch_shape)
         if batch == 0:
-            return x.new_zeros((*lead, *outer))
+            return x.new_zeros((*batch_shape, *outer))
         flat = x.detach().reshape(batch, *inner)
         if x.device.type == "cpu":
             found = self._on_cpu(flat, transposed)
         else:
             passes = self._trusted_on(x.device, x.dtype)
             found = passes.adjoint(flat) if transposed else passes.forward(flat)
-        return found.reshape(*lead, *outer)
+        return found.reshape(*batch_shape, *outer)
 
     def _on_cpu(self, x: Tensor, transposed: bool) -> Tensor:
         array = x.contiguous().numpy()

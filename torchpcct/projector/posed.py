@@ -146,14 +146,14 @@ class PosedEngine:
                 f"lie on {x.device}: move them with .cpu(), or give motion and geometry as numbers"
             )
         inner, outer = self.shapes(transposed)
-        lead = x.shape[: x.dim() - len(inner)]
-        if math.prod(lead) == 0:
-            return x.new_zeros((*lead, *outer))
+        batch_shape = x.shape[: x.dim() - len(inner)]
+        if math.prod(batch_shape) == 0:
+            return x.new_zeros((*batch_shape, *outer))
         with unswitched():
             poses = self.poses()
             flat = x.reshape(-1, *inner)
             out = cast(Tensor, _Pass.apply(flat, poses, self, transposed))
-        return out.reshape(*lead, *outer)
+        return out.reshape(*batch_shape, *outer)
 
     def derivatives(self, x: Tensor, tangents: Tensor) -> Tensor:
         """Changes of the readings of one volume along ``tangents (directions, views, 4, 3)`` of

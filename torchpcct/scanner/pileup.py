@@ -79,7 +79,7 @@ def recorded_rates(
     """
     energies = np.atleast_1d(np.asarray(energies_kev, dtype=np.float64))
     quanta = np.asarray(quanta_per_s, dtype=np.float64)
-    lead = quanta.shape[:-1]
+    batch = quanta.shape[:-1]
     quanta = quanta.reshape(-1, energies.size)
     dead, merge = detector.dead_time_ns * 1e-9, detector.merge_ns * 1e-9
     response = detector.response(energies)
@@ -99,7 +99,7 @@ def recorded_rates(
             out += live * (rates @ response.T).T
         else:
             out += live * _merged(detector, rates @ heights, merge)
-    return out.reshape(-1, *lead)
+    return out.reshape(-1, *batch)
 
 
 def _merged(detector: SiliconDetector, heights: Floats, merge_s: float) -> Floats:

@@ -381,13 +381,13 @@ def _require_scanner(scan: Any, scanner: Scanner) -> None:
     else:
         difference = np.inf
     if not difference < _SAME_AIR:
-        said = (
+        reason = (
             f"{100 * difference:.3g} %"
             if np.isfinite(difference)
             else f"{(found.shape[0], found.shape[-1])} and {air.shape} (bins, columns)"
         )
         raise ValueError(
-            f"the weights are of another scanner than the scan (readings in air differ: {said}): "
+            f"the weights are of another scanner than the scan (readings in air differ: {reason}): "
             "make them with bin_weights of the scanner, the tube voltage and the thresholds of "
             "the scan"
         )

@@ -127,7 +127,7 @@ def _recovered(
     kind: Callable[[str], str],
 ) -> tuple[float | None, list[str]]:
     """Mean contrast recovery over pairs of scans, None if one is refused, and the messages."""
-    found, said = [], []
+    found, unusual = [], []
     for pair in pairs:
         volumes, texts = [], []
         for scan in pair:
@@ -140,9 +140,9 @@ def _recovered(
             texts.append([*volume.report.get("warnings", []), *messages])
         usual = set(map(kind, texts[1]))
         # A drawing says of itself what it may leave out, whatever it draws.
-        said += [t for t in texts[0] if kind(t) not in usual or "was drawn, and disease" in t]
+        unusual += [t for t in texts[0] if kind(t) not in usual or "was drawn, and disease" in t]
         found.append(recovered_contrast(volumes[0] - volumes[1], truth))
-    return float(np.mean(found)), list(dict.fromkeys(said))
+    return float(np.mean(found)), list(dict.fromkeys(unusual))
 
 
 def _scanned(what: Anatomy, clean: Scan, grid: VolumeGrid, *, feature: bool) -> Scan:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from recon.vessel.particles import lead
+from recon.vessel.particles import sample_towards
 
 MEAN = np.array([1.0, -0.5, 0.3])
 SD = np.array([0.2, 0.5, 0.1])
@@ -28,7 +28,7 @@ def exact(sd):
 
 def test_gaussian_posterior_and_its_evidence():
     rng = np.random.default_rng(0)
-    found = [lead(rng.standard_normal((400, 3)), prior, posterior, rng) for _ in range(8)]
+    found = [sample_towards(rng.standard_normal((400, 3)), prior, posterior, rng) for _ in range(8)]
     mean, variance, log = exact(SD)
     points = np.concatenate([c.points for c in found])
     assert np.allclose(points.mean(0), mean, atol=0.15 * np.sqrt(variance))
@@ -42,8 +42,8 @@ def test_from_one_posterior_to_another():
     def wider(x):
         return prior(x)[0], -0.5 * (((x - MEAN) / (2 * SD)) ** 2).sum(1)
 
-    first = lead(rng.standard_normal((2000, 3)), prior, wider, rng)
-    second = lead(first.points, wider, posterior, rng, log_evidence=first.log_evidence)
+    first = sample_towards(rng.standard_normal((2000, 3)), prior, wider, rng)
+    second = sample_towards(first.points, wider, posterior, rng, log_evidence=first.log_evidence)
     assert second.log_evidence == pytest.approx(exact(SD)[2], abs=0.4)
     assert np.allclose(second.points.mean(0), exact(SD)[0], atol=0.15)
 
@@ -57,4 +57,6 @@ def test_what_the_prior_excludes_is_never_reached():
     def target(x):
         return half(x)[0], -0.5 * ((x[:, 0] + 1) / 0.1) ** 2
 
-    assert (lead(np.abs(rng.standard_normal((200, 3))), half, target, rng).points[:, 0] > 0).all()
+    assert (
+        sample_towards(np.abs(rng.standard_normal((200, 3))), half, target, rng).points[:, 0] > 0
+    ).all()
