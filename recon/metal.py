@@ -14,7 +14,9 @@ __all__ = ["metal_warnings"]
 DENSEST_HU = 3000.0
 """Enamel, the densest tissue. Titanium reads 16 000 HU."""
 _SIGMAS = 6.0
+"""Standard deviations of noise above enamel that are none of chance."""
 _AIR_HU = -1000.0
+"""CT number of air."""
 _RINGING = 0.5
 """How far a volume may read below air beside metal, over how far metal reads above air: an edge
 undershoots by a fifth at most, streaks of metal are shallower than metal is dense. What rings where

@@ -446,7 +446,9 @@ class Fbp(nn.Module):
 # To torch.compile and torch.export a layer is one operation, as a pass of the projector is: they
 # cannot look into numba kernels. A traced graph holds the handle of its layer.
 _LAYERS: weakref.WeakValueDictionary[int, Fbp] = weakref.WeakValueDictionary()
+"""Layers by their handles."""
 _HANDLES = itertools.count()
+"""Those that were given out."""
 
 
 @torch.library.custom_op(
@@ -508,6 +510,7 @@ _traced.register_autograd(_back, setup_context=_keep)
 
 
 _SIDES = ("first", "last")
+"""Ends of a row, in words."""
 
 
 def _transformed() -> bool:

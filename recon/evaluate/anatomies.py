@@ -110,7 +110,7 @@ class Anatomy:
         without = laid(np.zeros(local.shape[1:], np.int64), self.base)
         return laid(without, self.feature), without
 
-    def shares(self, grid: VolumeGrid) -> dict[tuple[str, str], Floats]:
+    def volume_fractions(self, grid: VolumeGrid) -> dict[tuple[str, str], Floats]:
         """(tissue with the feature, tissue without it) → its share of each voxel ``grid.shape``.
 
         See :func:`torchpcct.scene.raster.label_fractions`; ``grid`` is about the inset's middle as
@@ -131,13 +131,17 @@ class Anatomy:
         for k, (after, without) in enumerate(pairs):
             index[names.index(after), names.index(without)] = k
 
-        shares = label_fractions(lambda points: index[self.labels(points)], len(pairs), grid)
-        return {pair: share for pair, share in zip(pairs, shares, strict=True) if share.any()}
+        volume_fractions = label_fractions(
+            lambda points: index[self.labels(points)], len(pairs), grid
+        )
+        return {
+            pair: share for pair, share in zip(pairs, volume_fractions, strict=True) if share.any()
+        }
 
     def painted(self, grid: VolumeGrid, values: Mapping[str, float], *, feature: bool) -> Floats:
         """Mean over each voxel ``grid.shape`` of ``values`` of the tissues; of other tissues 0."""
         result = np.zeros(grid.shape)
-        for pair, share in self.shares(grid).items():
+        for pair, share in self.volume_fractions(grid).items():
             result += values.get(pair[0 if feature else 1], 0.0) * share
         return result
 

@@ -128,7 +128,7 @@ class Reader:
             (self.truth[0] - self.truth[1]).double().numpy(), [_SEEN_MM / s for s in grid.spacing]
         )
         dogs = dog_channels(grid, task.middle_mm, _CHANNELS, lowest=_LOWEST)
-        fullest = int(task.shares["signal"].sum((1, 2)).argmax())
+        fullest = int(task.volume_fractions["signal"].sum((1, 2)).argmax())
         one = np.zeros((grid.shape[0], 1, 1))
         one[fullest] = 1.0
         plane = VolumeGrid(

@@ -263,7 +263,7 @@ def _picture(seen: TaskResult) -> Figure:
     """The signal's fullest slice: truth, then every method at every exposure."""
     from matplotlib.figure import Figure
 
-    z = int(seen.task.shares["signal"].sum((1, 2)).argmax())
+    z = int(seen.task.volume_fractions["signal"].sum((1, 2)).argmax())
     methods = list(dict.fromkeys(m for m, _ in seen.volumes))
     exposures = sorted({e for _, e in seen.volumes})
     figure = Figure((2.0 * (len(methods) + 1), 2.2 * len(exposures)), dpi=120, layout="constrained")

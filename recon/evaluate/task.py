@@ -292,7 +292,7 @@ class Task:
     # --- where is what ----------------------------------------------------------------------------
 
     @cached_property
-    def shares(self) -> dict[str, Floats]:
+    def volume_fractions(self) -> dict[str, Floats]:
         """Tissue → its share of every voxel, ``grid.shape``; the signal's under ``signal``."""
         fractions = self._fractions
         return {
@@ -316,16 +316,16 @@ class Task:
         """HU of every voxel with and without the signal, ``grid.shape`` float32; outside of all
         bodies air."""
         values = dict(zip(ground_truth.tissues, ground_truth.values_hu, strict=True))
-        outside = 1.0 - np.sum(list(self.shares.values()), axis=0)
+        outside = 1.0 - np.sum(list(self.volume_fractions.values()), axis=0)
         absent = np.sum(
             [
                 share * values[self.background if t == "signal" else t]
-                for t, share in self.shares.items()
+                for t, share in self.volume_fractions.items()
             ],
             axis=0,
         )
         absent = absent - 1000.0 * outside
-        present = absent - ground_truth.contrast_hu * self.shares["signal"]
+        present = absent - ground_truth.contrast_hu * self.volume_fractions["signal"]
         return torch.from_numpy(present).float(), torch.from_numpy(absent).float()
 
     @cached_property
@@ -355,7 +355,7 @@ class Task:
     @cached_property
     def _signal_voxels(self) -> NDArray[np.bool_]:
         """Voxels that are read as the signal."""
-        return self._pure("signal", self.shares["signal"])
+        return self._pure("signal", self.volume_fractions["signal"])
 
     @property
     def _around(self) -> NDArray[np.bool_]:
@@ -385,26 +385,26 @@ class Task:
     @property
     def _largest(self) -> str:
         """The tissue that fills most of the inset."""
-        return max(self.shares, key=lambda t: float(self.shares[t].sum()))
+        return max(self.volume_fractions, key=lambda t: float(self.volume_fractions[t].sum()))
 
     @property
     def _rest(self) -> Floats:
         """Share of what the bodies lie in."""
-        return self.shares[self._largest]
+        return self.volume_fractions[self._largest]
 
     @cached_property
     def near(self) -> Tensor:
         """Mask ``grid.shape`` in which the error counts: all but what the bodies lie in, and
         what is close to it."""
         bodies = self._rest < 0.5
-        bodies |= self.shares["signal"] > 0.5
+        bodies |= self.volume_fractions["signal"] > 0.5
         away = ndimage.distance_transform_edt(~bodies, sampling=self.grid.spacing)
         return torch.from_numpy(away <= _NEAR_MM)
 
     @cached_property
     def beside(self) -> Tensor:
         """Mask ``grid.shape`` of the signal and what is beside it."""
-        signal = self._signal_voxels | (self.shares["signal"] > 0.5)
+        signal = self._signal_voxels | (self.volume_fractions["signal"] > 0.5)
         return torch.from_numpy(
             ndimage.distance_transform_edt(~signal, sampling=self.grid.spacing) <= BESIDE_MM
         )
@@ -426,7 +426,7 @@ class Task:
     @property
     def _constant(self) -> list[Floats]:
         """Share of every voxel of what has one value."""
-        return list(self.shares.values())
+        return list(self.volume_fractions.values())
 
     @cached_property
     def _inner(self) -> NDArray[np.bool_]:
@@ -440,8 +440,8 @@ class Task:
     def shells(self) -> tuple[Tensor, ...]:
         """Masks ``grid.shape`` about the bodies, the signal none of them if there are others,
         from near to far."""
-        signal = self.shares["signal"]
-        others = np.sum(list(self.shares.values()), axis=0) - self._rest - signal > 0.5
+        signal = self.volume_fractions["signal"]
+        others = np.sum(list(self.volume_fractions.values()), axis=0) - self._rest - signal > 0.5
         bodies = others if others.any() else signal > 0.5
         away = ndimage.distance_transform_edt(~bodies, sampling=self.grid.spacing)
         ends = np.arange(BESIDE_MM, _ABOUT_MM + BESIDE_MM, _SHELL_MM)
@@ -453,7 +453,7 @@ class Task:
     def rim(self) -> Tensor:
         """Mask ``grid.shape`` of the largest tissue's pure voxels beside bodies, where
         sharpening undershoots."""
-        pure = self.shares[self._largest] > 1.0 - 1e-6
+        pure = self.volume_fractions[self._largest] > 1.0 - 1e-6
         return torch.from_numpy(pure & (_depth(pure, self.grid.spacing) <= _RIM_MM))
 
     @cached_property
@@ -461,7 +461,7 @@ class Task:
         """Tissue → indices (of the flat volume) of voxels away from its edges and the rim of the
         inset."""
         found = {}
-        for tissue, share in self.shares.items():
+        for tissue, share in self.volume_fractions.items():
             deep = _depth(share > 1.0 - 1e-6, self.grid.spacing) > _FLAT_MM
             at = np.flatnonzero(deep & self._inner)
             if len(at) >= _FLAT_VOXELS:
@@ -471,7 +471,7 @@ class Task:
     @cached_property
     def middle_mm(self) -> tuple[float, float, float]:
         """``(z, y, x)`` of the signal's centre of mass."""
-        at = ndimage.center_of_mass(self.shares["signal"])
+        at = ndimage.center_of_mass(self.volume_fractions["signal"])
         z, y, x = (
             float(np.interp(p, np.arange(len(a)), a))
             for p, a in zip(at, self.grid.axes, strict=True)

@@ -292,16 +292,16 @@ class VesselTask(Task):
         return self.ground_truth_of(self._along_z(store, "present"), self._along_z(store, "absent"))
 
     @cached_property
-    def shares(self) -> dict[str, Floats]:
-        """See :attr:`Task.shares`."""
-        own, none = self._vessel.shares(self.grid), np.zeros(self.grid.shape)
+    def volume_fractions(self) -> dict[str, Floats]:
+        """See :attr:`Task.volume_fractions`."""
+        own, none = self._vessel.volume_fractions(self.grid), np.zeros(self.grid.shape)
         return {
             t: sum((own[n] for n in names if n in own), none) for t, names in self._groups.items()
         }
 
     @property
     def _beside(self) -> Floats:
-        return self.shares[self.background]
+        return self.volume_fractions[self.background]
 
 
 @dataclass(frozen=True, eq=False)
@@ -382,7 +382,7 @@ class _PaintedTask(Task):
         bodies = self._bodies(seen)
         maps = {
             t: project(torch.from_numpy(own).float())
-            for t, own in self.shares.items()
+            for t, own in self.volume_fractions.items()
             if t != self.patient
         }
         values = {
@@ -393,16 +393,18 @@ class _PaintedTask(Task):
         bodies[self.patient] = bodies[self.patient] - torch.stack(list(maps.values())).sum(0)
         ordered = [
             (maps | bodies)[tissue]
-            for tissue in [*self.shares, *(n for n in bodies if n != self.patient)]
+            for tissue in [*self.volume_fractions, *(n for n in bodies if n != self.patient)]
         ]
         limit = contrast_bound(seen.information(ordered))
         return GroundTruth(
-            tuple(self.shares), tuple(values[tissue] for tissue in self.shares), limit
+            tuple(self.volume_fractions),
+            tuple(values[tissue] for tissue in self.volume_fractions),
+            limit,
         )
 
     @property
     def _beside(self) -> Floats:
-        return self.shares[self.background]
+        return self.volume_fractions[self.background]
 
 
 @dataclass(frozen=True, eq=False)
@@ -457,10 +459,10 @@ class VoxelTask(_PaintedTask):
     def _painted(self, grid: VolumeGrid, values: Mapping[str, float], *, signal: bool) -> Floats:
         hu = dict(values) if signal else {**values, self.signal[0]: values[self.background]}
         return np.sum(
-            [share * hu[tissue] for tissue, share in self._shares_on(grid).items()], axis=0
+            [share * hu[tissue] for tissue, share in self._fractions_on(grid).items()], axis=0
         )
 
-    def _shares_on(self, grid: VolumeGrid) -> dict[str, Floats]:
+    def _fractions_on(self, grid: VolumeGrid) -> dict[str, Floats]:
         """Tissue → its share of every voxel of a grid, exactly."""
         along = [
             overlap(VolumeGrid(self.labels.shape, self.spacing, self.grid.center), grid, a)
@@ -477,9 +479,9 @@ class VoxelTask(_PaintedTask):
         }
 
     @cached_property
-    def shares(self) -> dict[str, Floats]:
-        """See :attr:`Task.shares`."""
-        own = self._shares_on(self.grid)
+    def volume_fractions(self) -> dict[str, Floats]:
+        """See :attr:`Task.volume_fractions`."""
+        own = self._fractions_on(self.grid)
         order = {
             ("signal" if n in self.signal else n): own[n]
             for ns in self._groups.values()
@@ -533,7 +535,7 @@ class AnatomyTask(_PaintedTask):
     @cached_property
     def _changes(self) -> dict[tuple[str, str], Floats]:
         """(tissue with the signal, without it) → its share of every voxel."""
-        return self._what.shares(_about_middle(self.grid, self.grid))
+        return self._what.volume_fractions(_about_middle(self.grid, self.grid))
 
     @property
     def _signal_hu(self) -> float:
@@ -545,8 +547,8 @@ class AnatomyTask(_PaintedTask):
         )
 
     @cached_property
-    def shares(self) -> dict[str, Floats]:
-        """See :attr:`Task.shares`."""
+    def volume_fractions(self) -> dict[str, Floats]:
+        """See :attr:`Task.volume_fractions`."""
         signal = np.sum(
             [own for (after, before), own in self._changes.items() if after != before], axis=0
         )
@@ -585,13 +587,13 @@ class AnatomyTask(_PaintedTask):
     def _rest(self) -> Floats:
         """Fat, and muscle as far as there is any: the vessel alone is looked at, whatever it
         lies on."""
-        return self.shares[self.patient] + self.shares.get("muscle", 0.0)
+        return self.volume_fractions[self.patient] + self.volume_fractions.get("muscle", 0.0)
 
     @property
     def _around(self) -> NDArray[np.bool_]:
         """Of the background, so far from the signal that its blur does not reach there."""
         away = ndimage.distance_transform_edt(
-            self.shares["signal"] == 0.0, sampling=self.grid.spacing
+            self.volume_fractions["signal"] == 0.0, sampling=self.grid.spacing
         )
         return self._pure(self.background, np.where(away > BESIDE_MM, self._beside, 0.0))
 

@@ -144,7 +144,7 @@ class PaintedVessel:
             labels[blood & (labels != index("core"))] = index("lumen")
         return labels
 
-    def shares(self, grid: VolumeGrid) -> dict[str, Floats]:
+    def volume_fractions(self, grid: VolumeGrid) -> dict[str, Floats]:
         """Tissue of :attr:`straight` → its share of each voxel ``grid.shape``, to about 0.001 rms.
 
         See :func:`torchpcct.scene.raster.label_fractions`.
@@ -156,9 +156,9 @@ class PaintedVessel:
 
     def painted(self, grid: VolumeGrid, values: Mapping[str, float]) -> Floats:
         """Mean over each voxel ``grid.shape`` of ``values`` of the tissues; of other tissues 0."""
-        shares = self.shares(grid)
+        volume_fractions = self.volume_fractions(grid)
         result: Floats = np.tensordot(
-            [values.get(n, 0.0) for n in shares], list(shares.values()), axes=1
+            [values.get(n, 0.0) for n in volume_fractions], list(volume_fractions.values()), axes=1
         )
         return result
 

@@ -102,12 +102,12 @@ class CoreSpace:
     ) -> None:
         self.vessel, self.fit, self.prior = vessel, fit, prior
         drawing = fit.drawing
-        layer = drawing.shares[1] - drawing.shares[2]
+        layer = drawing.fractions[1] - drawing.fractions[2]
         reach = 4.0 * float(vessel.sd.max())  # of soft edges, and of the voxels beside them
         inside = (
             (drawing.inner_distance < reach)
             & (drawing.lumen_distance > -reach)
-            & (drawing.shares[0] > 0)
+            & (drawing.fractions[0] > 0)
         )
         if prior.point is not None:
             inside &= np.linalg.norm(vessel.points - np.array(prior.point), axis=1) < 3.0
@@ -119,7 +119,7 @@ class CoreSpace:
         place[self.chosen] = np.arange(len(self.chosen))
         self.neighbours = place[vessel.neighbours[self.chosen]]
         self.points = np.ascontiguousarray(vessel.points[self.chosen])
-        self.inner = np.ascontiguousarray(drawing.shares[1][self.chosen])
+        self.inner = np.ascontiguousarray(drawing.fractions[1][self.chosen])
         self.lumen = np.ascontiguousarray(drawing.lumen_distance[self.chosen])
         self.lumen_normal = np.ascontiguousarray(drawing.lumen_normal[self.chosen])
         self.lumen_sd = np.ascontiguousarray(drawing.lumen_sd[self.chosen])
@@ -215,7 +215,7 @@ class CoreSpace:
         across, around = frame[:, 0], frame[:, 1]
         return np.stack([c * across + s * around, c * around - s * across, frame[:, 2]], axis=1)
 
-    def shares(self, shapes: Floats) -> NDArray[np.float32]:
+    def fractions(self, shapes: Floats) -> NDArray[np.float32]:
         """Share of each of the chosen voxels in every body, ``(m, n)``; ``ValueError`` for
         shapes not ``(m, 8)``."""
         shaped("shapes", shapes, (None, 8))
@@ -241,10 +241,10 @@ class CoreSpace:
 
     # -- data --------------------------------------------------------------------------------------
 
-    def evidence(self, shares: NDArray[np.float32]) -> Evidence:
+    def evidence(self, fractions: NDArray[np.float32]) -> Evidence:
         """Of bodies ``(m, n)``."""
-        image = np.empty(shares.shape[::-1], np.float32)
-        sharpened(np.ascontiguousarray(shares.T), self.neighbours, EXCESS, image)
+        image = np.empty(fractions.shape[::-1], np.float32)
+        sharpened(np.ascontiguousarray(fractions.T), self.neighbours, EXCESS, image)
         own = self.gram.energies(image.T)
         touched = np.flatnonzero(image.any(1))
         near = image[touched].T
@@ -256,7 +256,7 @@ class CoreSpace:
         mean = pull / precision
         log = 0.5 * pull * mean - 0.5 * np.log(precision * self.prior.contrast_sd**2)
         shift = solve_triangular(self.lower, white, lower=True, trans="T").T
-        volume = shares.sum(1, dtype=np.float64) * float(np.prod(self._step))
+        volume = fractions.sum(1, dtype=np.float64) * float(np.prod(self._step))
         return Evidence(log, mean, 1.0 / precision, shift, volume)
 
     def target(self, shapes: Floats) -> tuple[Floats, Floats]:
@@ -266,7 +266,7 @@ class CoreSpace:
         log = np.zeros(len(shapes))
         allowed = np.isfinite(prior)
         if allowed.any():
-            log[allowed] = self.evidence(self.shares(shapes[allowed])).log + (
+            log[allowed] = self.evidence(self.fractions(shapes[allowed])).log + (
                 self.none - self.against
             )
         return prior, log

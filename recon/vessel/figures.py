@@ -50,7 +50,7 @@ def draws_of(
     fit: Fit,
     space: CoreSpace,
     shapes: Floats,
-    shares: NDArray[np.float32],
+    fractions: NDArray[np.float32],
     texture: ResidualTexture,
     rng: np.random.Generator,
 ) -> dict[str, Floats]:
@@ -58,11 +58,11 @@ def draws_of(
 
     Args:
         vessel, fit, space: the fitted vessel, and the space of its core.
-        shapes: ``(m, 8)`` draws of the core's shape; shares: ``(m, n)``.
+        shapes: ``(m, 8)`` draws of the core's shape; fractions: ``(m, n)``.
         texture: of the tissues; widens the draws of tissue values.
         rng: of all randomness.
     """
-    seen = space.evidence(shares)
+    seen = space.evidence(fractions)
     m = len(shapes)
     delta = seen.mean[:, None] + np.sqrt(seen.variance)[:, None] * rng.standard_normal((m, _EACH))
     inverse = np.linalg.inv(space.lower @ space.lower.T)

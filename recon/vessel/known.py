@@ -243,7 +243,7 @@ class _LinearImage(torch.autograd.Function):
 def _apart(vessel: VesselModel, fit: Fit) -> NDArray[np.float32]:
     """1 for voxels that are so far from the vessel's wall that nothing there can be meant for
     it, 0 elsewhere."""
-    outside = vessel.on_grid(fit.drawing.shares[0]) < 0.5
+    outside = vessel.on_grid(fit.drawing.fractions[0]) < 0.5
     distance = ndimage.distance_transform_edt(outside, sampling=vessel.grid.spacing)
     return (distance >= _APART_MM).astype(np.float32)
 

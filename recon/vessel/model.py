@@ -125,8 +125,9 @@ class Drawing:
     """A vessel drawn on its voxels.
 
     Attributes:
-        soft: ``(n,)`` HU above fat, outlines of ``SOFT``; shares: ``(3, n)`` outer, inner, lumen,
-            likewise.
+        soft: ``(n,)`` HU above fat, outlines of ``SOFT``.
+        fractions: ``(3, n)`` of each voxel's volume: inside of the vessel, inside of its wall, and
+            in the lumen.
         image: ``(n,)`` HU above fat, as the operator takes it.
         jacobian: ``(n, parameters)`` float32, of ``image``, HU per unit; None where it was not
             asked for.
@@ -135,7 +136,7 @@ class Drawing:
     """
 
     soft: Floats
-    shares: Floats
+    fractions: Floats
     image: Floats
     jacobian: NDArray[np.float32] | None
     lumen_distance: Floats
@@ -205,7 +206,7 @@ class Fit:
     @property
     def layer(self) -> Floats:
         """``(n,)`` share of each voxel in the fibrous layer, less its bodies."""
-        _, inner, lumen = self.drawing.shares
+        _, inner, lumen = self.drawing.fractions
         share: Floats = np.clip(inner - lumen, 0.0, 1.0) * np.clip(
             1.0 - self.bodies.sum(0), 0.0, 1.0
         )
@@ -420,14 +421,14 @@ class VesselModel:
         steps = np.stack([np.full(n, wall - fat), fibrous - wall + mixed, blood - fibrous - mixed])
         whole = (steps * share).sum(0)
         soft = inside * whole
-        shares = share * inside
+        fractions = share * inside
         single = None
         if jacobian:
             single = np.zeros((n, self.size + len(contrasts)), np.float32)
-            single[:, FAT] = -shares[0]
-            single[:, WALL] = shares[0] - shares[1]
-            single[:, FIBROUS] = shares[1] - shares[2]
-            single[:, LUMEN] = shares[2]
+            single[:, FAT] = -fractions[0]
+            single[:, WALL] = fractions[0] - fractions[1]
+            single[:, FIBROUS] = fractions[1] - fractions[2]
+            single[:, LUMEN] = fractions[2]
             single[:, THICKNESS] = -inside * steps[1] * slope[1] * thickness
             single[:, BLUR] = inside * (steps * softer).sum(0)
             single[:, ENDS : ENDS + 3] = (-whole * end_slope[0] * end_share[1])[
@@ -442,11 +443,11 @@ class VesselModel:
             outward = inside * (steps[0] * slope[0] + steps[1] * slope[1]) * outer_rate
             self._outer.spread(outward, single[:, self.outer_part])
             for k, body in enumerate(bodies):
-                single[:, self.size + k] = body * (shares[1] - shares[2])
+                single[:, self.size + k] = body * (fractions[1] - fractions[2])
             single = self.as_projected(single)
         return Drawing(
             soft,
-            shares,
+            fractions,
             self.as_projected(soft),
             single,
             lumen_d,

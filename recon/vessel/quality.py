@@ -124,7 +124,7 @@ def beside(data: Quadratic, vessel: VesselModel, fit: Fit) -> Tensor | None:
     """
     left = residual_of(vessel, fit, data)
     near = np.zeros(vessel.grid.shape, bool)
-    near[tuple(vessel.index[fit.drawing.shares[0] > 0.02].T)] = True
+    near[tuple(vessel.index[fit.drawing.fractions[0] > 0.02].T)] = True
     step = np.array(vessel.grid.spacing)
     free = ndimage.distance_transform_edt(~near, sampling=step) > _APART_MM
     scores = np.where(free, scores_in(data, left, _BODY_MM), 0.0)
@@ -173,7 +173,7 @@ def leftover(vessel: VesselModel, fit: Fit) -> Leftover:
     score = float(abs(scores[place]))
     inside = vessel.lookup[place]
     z, y, x = (float(axis[k]) for axis, k in zip(grid.axes, place, strict=True))
-    beside = bool(inside < 0 or fit.drawing.shares[0][inside] < 0.5)
+    beside = bool(inside < 0 or fit.drawing.fractions[0][inside] < 0.5)
     return Leftover(
         score,
         float(pilot(data, residual_of(vessel, fit))[place]) if score > STRIKING else 0.0,
@@ -218,7 +218,7 @@ def texture(vessel: VesselModel, fit: Fit, rng: np.random.Generator) -> Residual
     With Q the residual's covariance under the model, E[rᵀTr] = tr TQ + τ² tr TQTQ and its variance
     is 2 tr TQTQ; the traces are estimated with random signs (Hutchinson).
     """
-    outer, _, lumen = fit.drawing.shares
+    outer, _, lumen = fit.drawing.fractions
     soft = np.clip(outer - lumen, 0.0, 1.0)
     for body in fit.bodies[:-1]:
         soft = soft * (1.0 - np.clip(body, 0.0, 1.0))

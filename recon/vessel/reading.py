@@ -310,11 +310,11 @@ def _calcified(vessel: VesselModel, fit: Fit, particles: int, rng: np.random.Gen
     for _ in range(_MOST_BODIES):
         space = CoreSpace(vessel, fit, _CALCIFICATION)
         tries = space.draw_prior(_LOOK, rng)
-        seen = space.evidence(space.shares(tries))
+        seen = space.evidence(space.fractions(tries))
         if not np.any((seen.log > _LEAST_LOG) & (seen.mean > 0.5 * CALCIFIED_HU)):
             break
         cloud = sample_towards(tries[:particles], space.nothing, space.target, rng)
-        found = space.evidence(space.shares(cloud.points))
+        found = space.evidence(space.fractions(cloud.points))
         if not (
             found.mean.mean() > 0.5 * CALCIFIED_HU
             and cloud.log_evidence > math.log(CERTAIN / (1 - CERTAIN))
@@ -337,9 +337,9 @@ def _with_body(
     expected: bool = False,
 ) -> Fit:
     """The vessel fitted again with the mean of a cloud of bodies beside those it has."""
-    layer = (fit.drawing.shares[1] - fit.drawing.shares[2])[space.chosen]
+    layer = (fit.drawing.fractions[1] - fit.drawing.fractions[2])[space.chosen]
     body = np.zeros((1, len(vessel.index)))
-    mean = space.shares(cloud.points).mean(0)
+    mean = space.fractions(cloud.points).mean(0)
     body[0, space.chosen] = np.where(
         layer > 0.02, np.clip(mean / np.maximum(layer, 0.02), 0.0, 1.0), 0.0
     )
@@ -381,7 +381,7 @@ def _read(
     space = CoreSpace(vessel, fit, prior_of_core)
     cloud = sample_towards(space.draw_prior(particles, rng), space.nothing, space.target, rng)
     first = cloud.log_evidence
-    seen = space.evidence(space.shares(cloud.points))
+    seen = space.evidence(space.fractions(cloud.points))
     if seen.mean.mean() > 0.5 * CALCIFIED_HU and others < _MOST_BODIES and not other_core:
         # The search with few trial bodies had missed it.
         other = _with_body(vessel, fit, space, cloud, float(seen.mean.mean()), expected=True)
@@ -396,9 +396,9 @@ def _read(
     space = again
     odds = math.log(prior / (1 - prior)) if 0 < prior < 1 else math.copysign(math.inf, prior - 0.5)
     presence = _probability(cloud.log_evidence + odds)
-    shares = space.shares(cloud.points)
+    fractions = space.fractions(cloud.points)
     tau = texture(vessel, fit, rng)
-    draws = draws_of(vessel, fit, space, cloud.points, shares, tau, rng)
+    draws = draws_of(vessel, fit, space, cloud.points, fractions, tau, rng)
     names = {
         "fat": "HU",
         "wall": "HU",
@@ -433,7 +433,7 @@ def _read(
     more, found = (
         (0.0, None)
         if presence < CERTAIN
-        else _one_more(vessel, fit, shares.mean(0), space, particles, rng)
+        else _one_more(vessel, fit, fractions.mean(0), space, particles, rng)
     )
     if found is not None and other_core is None:
         where, cloud_there, contrast_there = found
@@ -458,7 +458,7 @@ def _read(
         figures,
         {},
         given,
-        _regions(vessel, fit, space, shares, calcifications),
+        _regions(vessel, fit, space, fractions, calcifications),
         fit.image,
         square,
         spread,
@@ -517,11 +517,11 @@ def _one_more(
     def target(shapes: Floats) -> tuple[Floats, Floats]:
         prior, log = more.log_prior(shapes), np.zeros(len(shapes))
         allowed = np.flatnonzero(np.isfinite(prior))
-        shares = more.shares(shapes[allowed])
-        volume = shares.sum(1)
-        apart = (volume > 0.0) & (shares @ first[more.chosen] < _APART * volume)
+        fractions = more.fractions(shapes[allowed])
+        volume = fractions.sum(1)
+        apart = (volume > 0.0) & (fractions @ first[more.chosen] < _APART * volume)
         if apart.any():
-            log[allowed[apart]] = more.evidence(shares[apart]).log
+            log[allowed[apart]] = more.evidence(fractions[apart]).log
         return prior, log
 
     tries = more.draw_prior(_LOOK, rng)
@@ -533,12 +533,16 @@ def _one_more(
     probability = _probability(cloud.log_evidence)
     if probability < CERTAIN:
         return probability, None
-    return probability, (more, cloud, float(more.evidence(more.shares(cloud.points)).mean.mean()))
+    return probability, (
+        more,
+        cloud,
+        float(more.evidence(more.fractions(cloud.points)).mean.mean()),
+    )
 
 
 def _other_core(space: CoreSpace, cloud: Cloud, contrast: float, probability: float) -> OtherCore:
     """Place, size and value of a core beside the first."""
-    seen = space.evidence(space.shares(cloud.points))
+    seen = space.evidence(space.fractions(cloud.points))
     return {
         "probability": probability,
         "at_mm": cloud.points[:, :3].mean(0).tolist(),
@@ -552,14 +556,14 @@ def _regions(
     vessel: VesselModel,
     fit: Fit,
     space: CoreSpace,
-    shares: NDArray[np.float32],
+    fractions: NDArray[np.float32],
     calcifications: int,
 ) -> dict[str, NDArray[np.float32]]:
     core = np.zeros(len(vessel.index))
-    core[space.chosen] = shares.mean(0)
-    soft = fit.bodies[:-1] * np.clip(fit.drawing.shares[1] - fit.drawing.shares[2], 0.0, 1.0)
+    core[space.chosen] = fractions.mean(0)
+    soft = fit.bodies[:-1] * np.clip(fit.drawing.fractions[1] - fit.drawing.fractions[2], 0.0, 1.0)
     outer, inner, lumen, core, *bodies = vessel.voxel_means(
-        np.stack([*fit.drawing.shares, core, *soft], 1)
+        np.stack([*fit.drawing.fractions, core, *soft], 1)
     ).T
     layer, hard = (
         np.clip(inner - lumen, 0.0, 1.0),

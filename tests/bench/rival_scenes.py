@@ -163,7 +163,9 @@ class Bench:
             k: torch.from_numpy(v).float()
             for k, v in self.store.piece(f"places/{name}", "3", compute).items()
         }
-        share = {k: torch.from_numpy(v).float() for k, v in vessel.shares(self.grid).items()}
+        share = {
+            k: torch.from_numpy(v).float() for k, v in vessel.volume_fractions(self.grid).items()
+        }
         true = sum(share[k] * values[k] for k in TISSUES)
         fat = share["patient"] > 1 - 1e-6
         away = torch.from_numpy(ndimage.distance_transform_edt(fat.numpy(), self.grid.spacing))

@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from torchpcct.typing import Floats, Ints
 
 BATCHES = 16
-
+"""Independent parts of the histories, whose spread is the statistical error."""
 _KEV_ANGSTROM = 12.398419843
+"""hc in keV Å: an energy times its wavelength (CODATA 2018)."""
 
 
 @numba.njit(inline="always", cache=True)

@@ -23,22 +23,28 @@ if TYPE_CHECKING:
     from torchpcct.typing import Floats, Ints, Reals
 
 # exp(x) = 2^k exp(r): one loop without branches or calls, which LLVM turns into vector instructions
-# (numba calls the scalar libm otherwise: 4 times slower). Adding MAGIC leaves round(x / ln 2) in
-# the low bits of the sum.
+# (numba calls the scalar libm otherwise: 4 times slower).
 _LOG2E = 1.0 / math.log(2.0)
+"""1 / ln 2, so that x / ln 2 rounds to k."""
 _MAGIC = 1.5 * 2.0**52
+"""Added to a number below 2^51, it leaves the nearest whole number in the low bits of the sum."""
 _LN2_HIGH = 6.93147180369123816490e-01
+"""ln 2 in so few bits that k times it is exact (Cody and Waite, Software Manual for the Elementary
+Functions, 1980)."""
 _LN2_LOW = 1.90821492927058770002e-10
+"""The rest of ln 2."""
 _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9, _C10, _C11 = (1.0 / math.factorial(k) for k in range(2, 12))
 
-# Exponents stay where neither counts nor their products overflow; only passing iterates get there.
 _LOWEST = -300.0
+"""Least exponent: neither counts nor their products overflow; only passing iterates get there."""
 _HIGHEST = 200.0
+"""Largest exponent, for the same reason."""
 
 _PATIENCE = 40
 """After so many steps they are halved, after twice as many quartered, …"""
 
 _SUM = {"reassoc", "contract", "nsz"}
+"""What LLVM may change in sums: their order, and products and sums as one operation."""
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})

@@ -66,7 +66,7 @@ def test_the_feature_is_all_that_differs(name):
 
 def test_features_have_the_sizes_they_are_said_to_have():
     def volume_mm3(name, tissue):
-        shares = anatomy(name).shares(VolumeGrid((12, 12, 12), 0.4))
+        shares = anatomy(name).volume_fractions(VolumeGrid((12, 12, 12), 0.4))
         return (
             sum(
                 float(own.sum())
@@ -86,7 +86,7 @@ def test_features_have_the_sizes_they_are_said_to_have():
 
 def test_shares_are_those_of_the_labels_and_painting_is_their_mean():
     what, grid = anatomy("branch"), VolumeGrid((4, 20, 20), 0.4)
-    shares = what.shares(grid)
+    shares = what.volume_fractions(grid)
     np.testing.assert_allclose(np.sum(list(shares.values()), axis=0), 1.0, atol=1e-12)
     assert {pair for pair in shares if pair[0] != pair[1]} == {
         ("wall", "fat"),
@@ -111,14 +111,16 @@ def test_shares_are_those_of_the_labels_and_painting_is_their_mean():
 
 def test_what_the_task_of_an_anatomy_reads_is_its_truth(few):
     values = {**TISSUES_HU, "patient": -92.0, "signal": TISSUES_HU["calcium"]}
-    ground_truth = GroundTruth(tuple(few.shares), tuple(values[t] for t in few.shares), 1.0)
+    ground_truth = GroundTruth(
+        tuple(few.volume_fractions), tuple(values[t] for t in few.volume_fractions), 1.0
+    )
     assert ground_truth.tissues[:2] == ("signal", "lumen")
-    np.testing.assert_allclose(np.sum(list(few.shares.values()), axis=0), 1.0, atol=1e-12)
+    np.testing.assert_allclose(np.sum(list(few.volume_fractions.values()), axis=0), 1.0, atol=1e-12)
     present, absent = (t.double().numpy() for t in few.truth(ground_truth))
     change = present - absent
     # What changes is the feature, in proportion to its share: calcium for wall or for fibrous
     # tissue.
-    signal = few.shares["signal"]
+    signal = few.volume_fractions["signal"]
     np.testing.assert_array_equal(change == 0.0, signal == 0.0)
     steps = [TISSUES_HU["calcium"] - TISSUES_HU[t] for t in ("fibrous", "wall")]
     at = signal > 0
@@ -128,7 +130,7 @@ def test_what_the_task_of_an_anatomy_reads_is_its_truth(few):
     np.testing.assert_array_equal(weights.numpy() > 0, change > 0.5 * change.max())
     # The background is read where the truths agree.
     assert np.abs(change[around.numpy() > 0]).max() == 0.0
-    assert (few.shares["lumen"][around.numpy() > 0] > 0.99).all()
+    assert (few.volume_fractions["lumen"][around.numpy() > 0] > 0.99).all()
 
 
 @pytest.mark.extended
@@ -199,7 +201,7 @@ def test_the_muscle_that_a_vessel_lies_on_is_no_body():
     beside = replace(
         whole, grid=VolumeGrid((12, *whole.grid.shape[1:]), whole.grid.spacing, whole.grid.center)
     )
-    muscle = beside.shares["muscle"]
+    muscle = beside.volume_fractions["muscle"]
     assert (muscle[:, :, :8] == 1.0).all()
     assert not beside.near[:, :, :8].any()
     deep = ndimage.distance_transform_edt(muscle > 0.5, sampling=beside.grid.spacing) > 0.8

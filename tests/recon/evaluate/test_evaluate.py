@@ -215,7 +215,7 @@ def test_a_false_contour_is_a_fall_of_the_mean_error_with_the_distance():
 def test_only_what_lies_away_from_edges_is_read_as_nothing(task, found):
     (seen,) = found.results
     reader = Reader(task, task.truth(seen.ground_truth))
-    shares = np.max(list(task.shares.values()), axis=0)
+    shares = np.max(list(task.volume_fractions.values()), axis=0)
     assert (shares[task.quiet.numpy()] > 1.0 - 1e-6).all()
     away = ndimage.distance_transform_edt(shares > 0.999, sampling=task.grid.spacing)
     assert away[task.quiet.numpy()].min() > 0.6
@@ -582,7 +582,7 @@ def test_a_segmented_lesion_is_a_task(voxel_task, task, folder, tmp_path):
     # A column beside it would be 0.23; the staircase of the labels makes the sphere 1.3 % larger.
     assert float((change - exact).norm() / exact.norm()) < 0.08
     assert float(change.sum() / exact.sum()) == pytest.approx(1.0, abs=0.04)
-    assert float(mine.shares["signal"].sum()) * 0.4**3 == pytest.approx(
+    assert float(mine.volume_fractions["signal"].sum()) * 0.4**3 == pytest.approx(
         float((mine.labels == 7).sum()) * 0.1**3
     )
     truth, without = mine.truth(ground_truth)

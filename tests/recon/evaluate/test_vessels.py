@@ -32,7 +32,7 @@ def points_of_unit_cube(count):
 
 def off_by(vessel, grid, values, voxels):
     """RMS error in HU in so many of the voxels that a face crosses, drawn at random."""
-    shares = np.stack(list(vessel.shares(grid).values()))
+    shares = np.stack(list(vessel.volume_fractions(grid).values()))
     np.testing.assert_allclose(shares.sum(0), 1.0, atol=1e-12)
     crossed = np.argwhere(shares.max(0) < 1.0)
     cube, hu, errors = (
@@ -58,8 +58,8 @@ def test_shares_of_every_painted_task_are_converged(name):
     task = read_task(name)
     assert off_by(task._vessel, cut_out(task.grid, 3, 0.3), HU, 12) < 0.5
     few = replace(task, grid=cut_out(task.grid, 1))
-    assert list(few.shares) == list(few._groups)
-    np.testing.assert_allclose(np.sum(list(few.shares.values()), axis=0), 1.0, atol=1e-12)
+    assert list(few.volume_fractions) == list(few._groups)
+    np.testing.assert_allclose(np.sum(list(few.volume_fractions.values()), axis=0), 1.0, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -98,13 +98,16 @@ def test_painting_is_the_mean_of_the_values_and_bending_keeps_volumes():
     straight, tilted = (
         PaintedVessel(SHAPES[n][0], grid.center) for n in ("straight", "in_plane_x")
     )
-    shares = straight.shares(grid)
+    shares = straight.volume_fractions(grid)
     exact = straight.straight.volume_fractions(grid, 40)
     assert np.abs(np.stack(list(shares.values())) - exact).max() < 0.02
     assert np.sqrt(np.square(np.stack(list(shares.values())) - exact).mean()) < 3e-4
     painted = straight.painted(grid, {"lumen": 10.0, "wall": 2.0})
     np.testing.assert_allclose(painted, 10.0 * shares["lumen"] + 2.0 * shares["wall"])
-    core = tilted.shares(VolumeGrid((20, 20, 20), 0.2, (0.0, -1.0, 0.0)))["core"].sum() * 0.2**3
+    core = (
+        tilted.volume_fractions(VolumeGrid((20, 20, 20), 0.2, (0.0, -1.0, 0.0)))["core"].sum()
+        * 0.2**3
+    )
     a, b, c = tilted.plaque.core.semi_axes
     assert core == pytest.approx(4 / 3 * math.pi * a * b * c, rel=1e-3)
 

@@ -55,11 +55,11 @@ def test_fit_finds_tissues_and_outlines(vessel, fit):
     assert p[FIBROUS] == pytest.approx(VALUES["fibrous"], abs=8)
     truth = drawn_vessel.image(vessel.grid, 0.0).numpy()[tuple(vessel.index.T)]
     assert np.sqrt(np.mean((p[FAT] + vessel.voxel_means(fit.drawing.soft) - truth) ** 2)) < 8
-    assert fit.drawing.shares[2].sum() * 0.027 == pytest.approx(
+    assert fit.drawing.fractions[2].sum() * 0.027 == pytest.approx(
         np.pi * LUMEN_MM**2 * np.hypot(1, drawn_vessel.TILT) * 7.8, rel=0.02
     )
     outer = np.pi * (INNER_MM + WALL_MM) ** 2 * np.hypot(1, drawn_vessel.TILT) * 7.8
-    assert fit.drawing.shares[0].sum() * 0.027 == pytest.approx(outer, rel=0.03)
+    assert fit.drawing.fractions[0].sum() * 0.027 == pytest.approx(outer, rel=0.03)
     assert np.exp(p[THICKNESS]) == pytest.approx(WALL_MM, abs=0.08)
 
 
@@ -126,7 +126,7 @@ def test_evidence_of_a_body_is_the_ratio_of_two_gaussian_integrals(vessel, fit):
     """Against the joint Hessian of vessel and body, in float64."""
     space = CoreSpace(vessel, fit, CorePrior())
     shapes = space.draw_prior(5, np.random.default_rng(0))
-    shares = space.shares(shapes)
+    shares = space.fractions(shapes)
     seen = space.evidence(shares)
     p = len(fit.parameters)
     for k in range(5):
