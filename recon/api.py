@@ -265,7 +265,7 @@ def _there(scan: Scan, device: torch.device) -> Scan:
 
 
 def _within_memory(batches: Iterator[T], device: torch.device) -> Iterator[T]:
-    """The same batches; a device that is full is told of in one sentence."""
+    """The same batches; a full device is reported in one sentence."""
     try:
         yield from batches
     except torch.OutOfMemoryError as error:

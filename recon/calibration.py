@@ -388,7 +388,7 @@ class _Problem:
         step = inverse @ _products(own * w, rest)[:, 0]
         # Noise of the step: the readings' noise, of which a volume has explained a part, blurred.
         noisy = self._blurred(own * w)
-        if errors:  # of what was heard, a volume has explained a part
+        if errors:  # of the noise, a volume has explained a part
             noisy = left(noisy * variance * known) * w
         noise = inverse @ _products(noisy * variance, noisy) @ inverse
         spread = np.sqrt(np.maximum(np.diag(noise), 0.0))

@@ -254,7 +254,7 @@ def bm4d(
     Args:
         volume: ``(z, y, x)`` HU.
         noise_hu: standard deviation in flat tissue.
-        strength: factor on the noise that it is told.
+        strength: factor on the noise that it is given.
         covariance: of a voxel's noise with those around it, HU² or any multiple of it, the voxel
             itself in the middle; odd numbers of voxels, at most the volume's
             (:func:`recon.analytic.exact_noise.voxel_covariance` gives FBP's). None: white noise.

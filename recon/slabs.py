@@ -603,7 +603,7 @@ def reconstruct_to(
 
 
 class _Maker:
-    """Makes slabs: all that a job is told."""
+    """Makes slabs: all that a job needs."""
 
     def __init__(
         self,

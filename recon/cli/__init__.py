@@ -3,8 +3,8 @@
 :mod:`~recon.cli.starting` has the first commands of a newcomer, :mod:`~recon.cli.scans` those that
 make scans and volumes, :mod:`~recon.cli.measuring` the measurement of methods and the studies,
 :mod:`~recon.cli.looking` what shows files, :mod:`~recon.cli.plaque` reads tissues,
-:mod:`~torchpcct.acquisition.config` reads what ``simulate`` is told, :mod:`~recon.cli.parsing` is
-what all share.
+:mod:`~torchpcct.acquisition.config` reads the configuration of ``simulate``,
+:mod:`~recon.cli.parsing` is what all share.
 """
 
 from __future__ import annotations

@@ -460,7 +460,7 @@ def executing(arguments: argparse.Namespace, out: Path) -> Iterator[Executor | N
 
 
 class Ended(KeyboardInterrupt):
-    """A signal of the system has told the command to end, as Ctrl-C does; ``number`` is the
+    """A signal of the system asks the command to end, as Ctrl-C does; ``number`` is the
     signal's."""
 
     def __init__(self, number: int) -> None:

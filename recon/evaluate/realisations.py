@@ -149,7 +149,7 @@ class Realisations:
         }
 
     def noise_free(self, present: bool, exposure_s: float) -> Simulated:
-        """Without noise; ``exposure_s`` is what a method is told."""
+        """Without noise; ``exposure_s`` is what a method gets to know."""
         return Simulated(self, self.clean[0 if present else 1], exposure_s, -1, present)
 
     def pair(self, exposure_s: float, k: int) -> tuple[Simulated, Simulated]:

@@ -73,7 +73,7 @@ _AGAIN_S = 0.5
 _NO_WORKER_S = 30.0
 """Until a cluster without workers is reported."""
 _LAST_S = 5.0
-"""For processes that are told to end."""
+"""Between asking processes to end and ending them."""
 _SAFE_PATH = "PYTHONSAFEPATH"
 """Environment variable by which Python leaves the current folder out of its path."""
 
@@ -243,7 +243,7 @@ class Processes(ThreadPoolExecutor):
         self.shutdown(cancel_futures=kind is not None)
 
     def end(self) -> None:
-        """End the processes now: each is told, and has a few seconds to take back what it is
+        """End the processes now: each is asked to, and has a few seconds to take back what it is
         writing."""
         with self._starting:
             self._ended = True
@@ -299,7 +299,7 @@ def _set_safe_path(value: str | None) -> None:
 
 
 class _EndSignal(BaseException):
-    """A signal has told a process to end: what its job is writing is taken back on the way out."""
+    """A signal asks a process to end: what its job is writing is taken back on the way out."""
 
 
 _working = False
@@ -520,8 +520,8 @@ def _compiling(own: bool) -> Iterator[Callable[[], float]]:
 
 @contextlib.contextmanager
 def captured_warnings(*loggers: str, alone: bool = False) -> Iterator[list[str]]:
-    """The warnings that loggers are given meanwhile; ``""`` is the root. ``alone``: nobody else
-    hears them."""
+    """The warnings that loggers are given meanwhile; ``""`` is the root. ``alone``: no other
+    handler gets them."""
     messages: list[str] = []
 
     class Listener(logging.Handler):
@@ -580,7 +580,7 @@ def _do_job(call: bytes, module: str, digest: str, makes: tuple[str, ...], of: _
     start = time.perf_counter()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # What a worker logs the client says instead; of its own process it has heard it.
+        # What a worker logs the client logs for it; what its own process logs stands already.
         with _compiling(own) as compiled, captured_warnings(*([] if own else [""])) as messages:
             value = function(folder, *args)
     except OSError as error:

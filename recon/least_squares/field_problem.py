@@ -194,7 +194,7 @@ class FieldProblem:
         options: PwlsOptions,
         advance: Callable[[float], None],
     ) -> Iterator[Result]:
-        """PWLS of every scan, slice by slice, from FBP as the first volume; ``advance`` is told
+        """PWLS of every scan, slice by slice, from FBP as the first volume; ``advance`` gets
         the finished share."""
         hu = self.mu_ref / 1000.0
         for i, scan in enumerate(scans):

@@ -305,7 +305,7 @@ class InsetProblem:
         options: PwlsOptions,
         advance: Callable[[float], None],
     ) -> Iterator[Result]:
-        """PWLS of all scans together; ``advance`` is told the finished share of them."""
+        """PWLS of all scans together; ``advance`` gets the finished share of them."""
         data = [self.data(s) for s in scans]
         terms = [self.term(s, y) for s, y in zip(scans, data, strict=True)]
         found, report = self.solve(Quadratic.joined(terms), prior, **options)

@@ -193,7 +193,7 @@ def blockwise(
 
     Args:
         network: the learned prior, or what stands for it.
-        scales: ``(z, y, x)`` noise scale of each voxel, HU: each block is told its own.
+        scales: ``(z, y, x)`` noise scale of each voxel, HU: each block gets its own.
         estimate, towards, condition, smoothed: see :meth:`recon.mbir.network.Network.forward`.
         block: voxels along each axis that a block gives; with those it shares with its neighbours
             ``2 · halo`` more. A multiple of 8, as ``halo``: blocks of voxels must be those of the

@@ -49,7 +49,7 @@ class PlugAndPlay(nn.Module):
     voxel's noise there, HU: in noise units it follows from the spectrum of H
     (:func:`recon.mbir.unrolled.guide_noise`), times the noise scale. It is that of the first step,
     and later ones have hardly less. The noise is correlated, as that of FBP is: a denoiser of white
-    noise that is told its standard deviation takes away less than it could at low frequencies.
+    noise that is given its standard deviation takes away less than it could at low frequencies.
 
     Args:
         denoiser: of ``(volume)`` or ``(volume, sigma)``, or one of deepinv

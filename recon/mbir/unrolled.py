@@ -200,7 +200,7 @@ class Unrolled(nn.Module):
 
 
 def bound(prior: Prior, problem: Quadratic, spectrum: Tensor) -> Prior:
-    """A prior that is told the noise of a problem, if it asks for it; ``spectrum`` is that of
+    """A prior that is given the noise of a problem, if it asks for it; ``spectrum`` is that of
     the problem."""
     if not isinstance(prior, PlugAndPlay):
         return prior

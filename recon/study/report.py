@@ -74,7 +74,7 @@ def around(name: str, ours: float, paper: float, tolerance: float, note: str = "
 
 
 def render(name: str, data: Mapping[str, object]) -> str:
-    """The text of a report, or another text that a study tells.
+    """The text of a report, or another text of a study.
 
     Args:
         name: of the template, without its ending, e.g. ``"phantom"``.

@@ -40,7 +40,7 @@ PASSING = (
     "peak_memory",
     "tables",
 )
-"""Keys of results that tell of the run and not of what was found: they differ from run to run.
+"""Keys of results that describe the run and not what was found: they differ from run to run.
 Tables are Markdown of records that stand beside them, and hold seconds."""
 
 

@@ -126,8 +126,8 @@ class StudySettings:
 
 
 class Timed:
-    """Progress that counts the seconds of every step, by the wall: each time until the step that is
-    told next.
+    """Progress that counts the seconds of every step, by the wall: each time until the next
+    step is named.
 
     Attributes:
         seconds: step, up to a colon in its name, → seconds, in the order in which the steps came

@@ -214,7 +214,7 @@ def measure(
 def _noisy(
     s: SpectralSettings, pieces: Pieces, k: int, scan: SpectralScan | None = None
 ) -> tuple[Tensor, list[Tensor], dict[str, object]]:
-    """FBP of a realisation, its line integrals if MBIR needs them, and what is told of its rays."""
+    """FBP of a realisation, its line integrals if MBIR needs them, and figures of its rays."""
     scan = scan or SpectralScan(s, pieces=pieces)
 
     def draw() -> tuple[Tensor, list[Tensor], dict[str, object]]:
