@@ -177,6 +177,11 @@ class Geometry:
         return _axis(self.columns, self.column_pitch, self.column_offset)
 
     @property
+    def ray_distances(self) -> Floats:
+        """Distance from the axis of the ray to every column centre, signed, ``(columns,)`` mm."""
+        raise NotImplementedError
+
+    @property
     def row_positions(self) -> Floats:
         """Row centres along z on the detector, ``(rows,)`` mm; 0 without rows."""
         return np.zeros(1)
@@ -288,7 +293,6 @@ class ParallelBeam(Geometry):
 
     @property
     def ray_distances(self) -> Floats:
-        """Distance from the axis of the ray to every column centre, signed, ``(columns,)`` mm."""
         return self.column_positions
 
     @property
@@ -336,7 +340,6 @@ class _Divergent(Geometry):
 
     @property
     def ray_distances(self) -> Floats:
-        """Distance from the axis of the ray to every column centre, signed, ``(columns,)`` mm."""
         return self.sod * np.sin(self.fan_angles)
 
     @property

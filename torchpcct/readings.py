@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.geometry import Geometry
-from torchpcct.scan_grid import cells_at_axis
 from torchpcct.scanner.linearisation import WaterLinearisation
 from torchpcct.validate import number
 
@@ -145,7 +144,7 @@ def _correction(
     """The map of line integrals, and the unit of volumes."""
     columns = geometry.columns
     if mu_water is None:
-        mu = _PSEUDO_DEPTH / (columns * cells_at_axis(geometry)[-1])
+        mu = _PSEUDO_DEPTH / (columns * geometry.cell)
     else:
         mu = number("mu_water", mu_water, positive=True, unit="mm⁻¹")
     unit = "mm^-1" if mu_water is None else "HU"

@@ -12,7 +12,7 @@ import numpy as np
 
 from recon.analytic.angular_weights import INNER_GAP_RAD, angular_weights
 from recon.analytic.any_orbit import rebin_to_circle
-from recon.analytic.detector_edges import cut_off, reach
+from recon.analytic.detector_edges import cut_off
 from torchpcct.angles import OPEN_GAP_STEPS, SAME_VIEW, is_offset
 from torchpcct.checks.defects import BRIGHT
 from torchpcct.detector_window import footprint
@@ -280,7 +280,7 @@ def _unmeasured_texts(lines: Tensor, geometry: Any, grid: VolumeGrid) -> list[st
     directions of the views less its fan angle, that at -t the same lines from their other ends.
     """
     mean = lines.reshape(geometry.views, -1, geometry.columns).double().mean((0, 1)).numpy()
-    t = reach(geometry)
+    t = geometry.ray_distances
     seen = np.abs(t) <= math.hypot(*grid.center[-2:]) + math.hypot(*grid.extent[-2:]) / 2
     seen &= mean > _RIM * mean.max(initial=0.0)
     columns = np.flatnonzero(seen)
@@ -303,7 +303,7 @@ def _unmeasured_texts(lines: Tensor, geometry: Any, grid: VolumeGrid) -> list[st
 def _gaps(geometry: Any) -> Floats:
     """Largest angle between directions next to each other in which the lines of each column are
     measured, ``(columns,)`` rad."""
-    t = reach(geometry)
+    t = geometry.ray_distances
     fan = np.zeros_like(t) if geometry.parallel else geometry.fan_angles
     found = np.zeros(t.size)
     for column in range(t.size):

@@ -57,12 +57,6 @@ class Rows(NamedTuple):
 
 
 @checked
-def reach(geometry: Beam) -> Floats:
-    """Distance from the axis of the ray to every column centre, signed, ``(columns,)`` mm."""
-    return np.asarray(geometry.ray_distances)
-
-
-@checked
 def cut_off(lines: Tensor, geometry: Beam, weights: Floats) -> tuple[bool, bool]:
     """Whether the rows end inside the object, at the first and at the last column.
 
@@ -144,7 +138,7 @@ def mirrored(rows: Rows, grid: VolumeGrid, travel: float = 0.0) -> Rows:
     g = rows.geometry
     if not _leaves_out_short_side(rows.weights, g):
         return rows
-    t = reach(g)
+    t = g.ray_distances
     half_cell = 0.5 * (t[-1] - t[0]) / max(t.size - 1, 1)
     if grid.in_plane_radius + travel <= min(-t[0], t[-1]) + half_cell:
         return rows
@@ -170,7 +164,7 @@ def continued(rows: Rows, sides: tuple[bool, bool], outside: float) -> Rows:
     if outside <= 0 or not any(room) or g.columns < _FEWEST_COLUMNS:
         return rows
     wide = g.widened(*room)
-    t = reach(wide)
+    t = wide.ray_distances
     cone, heights = g.has_rows, g.row_positions
     fit = max(_FEWEST_COLUMNS, min(32, g.columns // 20))
     parts = [rows.lines]

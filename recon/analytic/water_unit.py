@@ -13,7 +13,6 @@ from torch import Tensor
 
 from recon.analytic.angular_weights import angular_weights
 from recon.analytic.backproject import backproject
-from recon.analytic.detector_edges import reach
 from recon.analytic.filter_plan import FilterPlan
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import FanBeam, Geometry, ParallelBeam, VolumeGrid, beam
@@ -80,7 +79,7 @@ def unit_warnings(lines: Tensor, geometry: Geometry, mu_water: float) -> list[st
         return []
     p = p[:, row]
     # No object is thinner along all rays than it is wide in its narrowest view.
-    cell = np.abs(np.gradient(reach(beam(geometry))))
+    cell = np.abs(np.gradient(beam(geometry).ray_distances))
     values = p.numpy()
     seen = values > _SHADOW * float(values.max())
     across = float((seen * cell).sum(1).min())

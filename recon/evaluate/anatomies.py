@@ -4,7 +4,7 @@ with exact truths.
 A reconstruction that knows what vessels look like may close an ulcer, flatten a thrombus or draw a
 wall that is not there. Each :class:`Anatomy` is a pair of scenes about the middle of an inset, with
 a feature and without it. On the same noise realisation the difference of two volumes is what a
-method shows of the feature, and what it shows beside. :class:`recon.evaluate.tasks.AnatomyTask`
+method shows of the feature, and what else it shows. :class:`recon.evaluate.tasks.AnatomyTask`
 measures it.
 
 Scenes are made of parts, laid over each other in order. Shapes and CT numbers are our own choice of
@@ -241,7 +241,7 @@ def _core(tissue: str = "core", plaque: Plaque = _PLAQUE) -> list[AnatomyPart]:
 def _second(
     distance: float, tilt: float, tissue: str = "lumen", radius: float = 0.95
 ) -> list[AnatomyPart]:
-    """Another vessel beside, its axis ``distance`` mm off on the side of the plaque."""
+    """Another vessel next to the first, its axis ``distance`` mm off on the side of the plaque."""
     u = (0.0, math.sin(tilt), math.cos(tilt))
     start, length = (distance, -4.0 * u[1], -4.0 * u[2]), 8.0
     return [

@@ -37,8 +37,8 @@ class Drawn:
     Attributes:
         image: T, HU ``(z, y, x)``, differentiable in the data as far as it says so; None: nothing.
         why: nothing is drawn, for the report and its warning; empty with an image.
-        report: for the volume's report beside.
-        warnings: for the volume's report beside.
+        report: added to the volume's report.
+        warnings: added to those of the volume's report.
         objection: what speaks against T, given the reconstruction around it, HU ``(z, y, x)``;
             empty: nothing. A T that is objected to is not drawn.
     """

@@ -440,7 +440,7 @@ def _ready(given: Prior | str) -> Prior:
 
 
 class _Note(NamedTuple):
-    """What report and warnings of a volume hold beside."""
+    """What is added to the report and the warnings of a volume."""
 
     report: JsonObject
     warnings: list[str]

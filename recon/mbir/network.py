@@ -5,8 +5,8 @@ towards the data would make of it, and gives a new estimate. (To give what must 
 with the other sign, takes ten times as long to learn: the noise passes through every layer then.)
 Convolutions have no bias and every nonlinearity is a leaky ReLU, so the network is homogeneous:
 twice the input gives twice the output, and a volume of zeros stays zero (Mohan, Kadkhodaie,
-Simoncelli, Fernandez-Granda 2020, ICLR: bias-free networks generalise over noise levels). What it
-must know beside, the noise scale in HU (tissues have their HU), the fidelity and the step, changes
+Simoncelli, Fernandez-Granda 2020, ICLR: bias-free networks generalise over noise levels). What else
+it must know, the noise scale in HU (tissues have their HU), the fidelity and the step, changes
 gains of its channels only.
 
 A homogeneous network shrinks what it is unsure of towards 0, and 0 is the value of the surround

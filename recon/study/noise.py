@@ -4,7 +4,7 @@ establish.
 The ROI means of FBP are inner products of the line integrals with adjoint vectors
 (:mod:`recon.analytic.exact_noise`). So their joint covariance is exact, and hundreds of
 realisations cost one noisy scan each instead of a reconstruction per kernel and voxel size; a few
-are reconstructed in full beside, which must give the same ROI means.
+are reconstructed in full, too, which must give the same ROI means.
 
 All settings (kernels × voxel sizes) of a realisation are made of one scan: their ROI means are
 jointly normal with that covariance. So three things are computable: the truth (exact CNR of every

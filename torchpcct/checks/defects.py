@@ -393,7 +393,7 @@ def _isolated(
     reach: int = 1,
 ) -> NDArray[np.int64]:
     """Those of the zeros ``at`` ``(k, 3)`` whose non-zero neighbours in the row and the next rows
-    are bright on both sides; and not both dim in the rows, or the views, beside: a detail as narrow
+    are bright on both sides; and not both dim in the neighbouring rows or views: a detail as narrow
     as a cell goes on there."""
     values = [[_around(n, at, side * dc) for dc in range(1, reach + 1)] for side in (-1, 1)]
     stacked = np.ma.masked_less_equal(np.stack([np.concatenate(v) for v in values]), 0.0)
@@ -409,7 +409,7 @@ def _isolated(
 
 
 def _dim_rows(n: NDArray[np.float32], at: NDArray[np.int64], light: float) -> NDArray[np.bool_]:
-    """Whether the zeros ``at`` have only dim neighbours in the rows beside, as an upright detail
+    """Whether the zeros ``at`` have only dim neighbours in the next rows, as an upright detail
     has."""
     if n.shape[1] == 1:
         return np.zeros(len(at), bool)

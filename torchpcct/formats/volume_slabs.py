@@ -1,8 +1,8 @@
 """Volumes that are written slab by slab along z, larger than memory: NIfTI (``.nii``) and OME-Zarr
 (``.zarr``).
 
-What is not complete stands beside its place, with ``.unfinished`` behind its name, and what is in
-it already in a journal (``.unfinished.json``). Nothing takes the name that was asked for before the
+An unfinished volume lies in the same folder, with ``.unfinished`` behind its name, and a journal of
+what it holds already (``.unfinished.json``). Nothing takes the name that was asked for before the
 last slab is on the disk.
 """
 
