@@ -16,6 +16,14 @@ Voxels do not draw edges where they are: readings at a step of the fitted ones m
 in clear data by many times their noise. χ² is tested in the other readings, which no voxel's size
 moves, gains with that part of a step as noise of its own; what is left at steps is a finding where
 it is more than the noise itself.
+
+What voxels leave of a sound scan also lies off by whole views and rows: an object that ends within
+a row covers more of it in views in which it is nearer to the source, and a fit spreads what it
+cannot explain. It differs from column to column, however, where a gain, or an angle, does the same
+to all columns of a view. Their common part is therefore compared with that in which blocks of
+columns differ (analysis of variance; Fisher 1925, Statistical Methods for Research Workers), after
+what looks like the object itself has been taken out where nobody knows where it ends: in the
+outermost rows.
 """
 
 from __future__ import annotations
@@ -55,6 +63,8 @@ CENTRE_TOLERANCE = 0.05
 """Columns beside their place that are no finding: noise in millions of readings tells a hundredth,
 which voxels and interpolation leave. A reconstruction takes most of an error up: a column off
 leaves the more."""
+ANGLE_TOLERANCE = 0.05
+"""Steps (rms) by which views may lie beside their angles."""
 LEAK = (0.02, 0.06)
 """Part of what voxels leave at edges, in χ², that looks like a shift of the columns, or that the
 fit spreads over the other readings of whole views or rows, where nothing is wrong: of thin plates
@@ -69,6 +79,17 @@ _DENSE_SHARE = 2.0
 """How many times more the dense rays must lie off than the others for beam hardening."""
 _HARMONICS = 3
 """Harmonics of the turn that are fitted to the views."""
+_BLOCKS = 8
+"""Blocks of columns whose gains are compared."""
+COMMON = 5.0
+"""How many times larger than by what blocks of columns differ their common gain must be: what
+voxels leave is alike in neighbouring blocks, in 220 sound cone scans up to 4 times (tubes that
+drift by 2 %: 7 to 145 times)."""
+COMMON_SLOW = 8.0
+"""The same of slow drifts: in sound scans up to 30 times in seven patterns together (drifts by 2 %:
+54 times and more)."""
+_TINY = torch.finfo(torch.float64).tiny
+"""What a weight is divided by that is 0."""
 _LARGE = 1e5
 """Mean from which on the tails of χ² are those of a transformed normal."""
 
@@ -80,7 +101,8 @@ class ResidualTest:
     Attributes:
         chi2: weighted squared residual per reading.
         p_values: cause → probability that noise alone looks like it at least so much.
-        sizes: cause → its estimated size where it has one: ``centre`` in columns.
+        sizes: cause → its estimated size where it has one: ``centre`` in columns, ``angles`` in
+            steps between views (rms).
         findings: what was found, in words; empty: nothing at the stated rate of false alarms.
     """
 
@@ -110,8 +132,8 @@ def residual_test(
 
     Returns:
         The tests ``level`` (χ² itself, at edges and beside them), ``centre`` (a shift of the
-        columns), ``views`` (gain from view to view and its slow drift over the scan), ``rows``
-        (gain from row to row).
+        columns), ``angles`` (views beside their angles), ``views`` (gain from view to view and its
+        slow drift over the scan), ``rows`` (gain from row to row).
 
     Raises:
         ValueError: shapes that differ or have not three axes, negative weights or none at all, NaN
@@ -135,12 +157,16 @@ def residual_test(
         raise ValueError("residual and fitted must be finite where the weight is not 0")
     wr = w * r
     chi2 = float((wr * r).sum()) / count
-    level = false_alarms / 4.0
+    level = false_alarms / 5.0
     p_values, sizes, findings = {}, {}, []
 
     along = [_steps(lines, axis) for axis in range(3)]
     largest = torch.stack(along).amax(0)
-    quiet = w * largest.square() <= QUIET
+    # Whether the object ends beyond the outermost rows, or just within them, no reading says.
+    beyond = torch.zeros_like(w, dtype=torch.bool)
+    if residual.shape[1] > 1:
+        beyond[:, [0, -1]] = (w * lines.square() > QUIET)[:, [0, -1]]
+    quiet = (w * largest.square() <= QUIET) & ~beyond
     few = int((quiet & (w > 0)).sum()) < min(_FEWEST_QUIET, count / 2)
     if few:
         quiet = torch.ones_like(quiet)
@@ -198,32 +224,63 @@ def residual_test(
                 "(the detector's column offset) is wrong"
             )
 
+    # A view at another angle differs by a part of what neighbouring views do.
+    turned = torch.zeros_like(lines)
+    turned[1:-1] = (lines[2:] - lines[:-2]) / 2.0
+    weight, total = (w * turned.square()).sum(1), (wr * turned).sum(1)
+    if bool((weight > 0).any()):
+        tolerated = ANGLE_TOLERANCE**2 * float(weight.sum())
+        p_values["angles"] = _in_common(total, weight, None, tolerated)
+        known = weight.sum(1) > 0
+        off = total.sum(1)[known] / weight.sum(1)[known]
+        excess = float((off.square() * weight.sum(1)[known] - 1.0).sum() / weight.sum())
+        sizes["angles"] = math.sqrt(max(excess, 0.0))
+        # A wrong centre moves views, too.
+        if p_values["angles"] < level and not any("rotation centre" in text for text in findings):
+            findings.append(
+                f"the views lie about {sizes['angles']:.1g} of a step or more beside the described "
+                "angles: the gantry does not turn evenly, or the object trembles; give the "
+                "measured angle of each view"
+            )
+
     # Of a face along the rows voxels leave the same in all columns and views, of other steps a part
     # in either direction: noise of its own.
     level_rows = torch.where(w * along[1].square() <= QUIET, w, 0.0)
     if not bool((level_rows > 0).any()):
         level_rows = w
     level_r = level_rows * r
+    inner = level_rows.clone()
+    if residual.shape[1] > 1:
+        inner[:, [0, -1]] = 0.0
     of_cells = _gain_variance(level_rows, level_r)
-    for name, axes, parts in (("views", (1, 2), 2), ("rows", (0, 2), 1)):
-        weight, total = level_rows.sum(axes), level_r.sum(axes)
-        # Of a cell's gain the views of a row have the same part.
-        by_cell = level_rows.square() if name == "views" else level_rows.sum(0).square()[None]
-        extra = (level_rows * of_voxels).sum(axes) + of_cells * by_cell.sum(axes)
-        noisier = 1.0 + extra / weight.clamp_min(torch.finfo(weight.dtype).tiny)
-        weight, total = weight / noisier, total / noisier
-        known = weight > 0
-        scores = total[known] / weight[known].sqrt()
+    for name, axes, parts in (("views", (1, 2), 4), ("rows", (0, 2), 2)):
+        gain = GAIN_TOLERANCE * (rows if name == "rows" else 1.0)
+        patterns: list[Tensor | None] = [None]
         # Every view alone, and the slow drifts over all of them, which add up what single views
         # cannot tell.
-        gain = GAIN_TOLERANCE * (rows if name == "rows" else 1.0)
+        if name == "views" and len(w) > 4 * _HARMONICS:
+            patterns.append(_slow(len(w)))
+        # Whatever lies off in rows that end in others, by more than all that voxels leave.
+        weight = inner.sum(axes)
+        noise = (inner * of_voxels).sum(axes) + of_cells * _cells_squared(inner, name).sum(-1)
+        noisier = 1.0 + noise / weight.clamp_min(_TINY)
+        weight, total = weight / noisier, (inner * r).sum(axes) / noisier
         tolerated = gain**2 * float(weight.sum()) + leaks
-        tails = [_upper_tail(float(scores.square().sum()), scores.numel(), tolerated)]
-        if parts == 2 and scores.numel() > 4 * _HARMONICS:
-            tails.append(_upper_tail(*_drift(total, weight), tolerated))
+        tails = [_upper_tail(*_alike(total, weight, p), tolerated) for p in patterns]
+        # What all columns have in common, by more than voxels leave: that differs among them.
+        seen, total = _beside_object(level_rows, r, lines, name)
+        weight, total = seen.sum(axes[0]), total.sum(axes[0])
+        noise = of_cells * _cells_squared(seen, name).sum(-1, keepdim=True)
+        noisier = 1.0 + noise / weight.sum(1, keepdim=True).clamp_min(_TINY)
+        weight, total = weight / noisier, total / noisier
+        # Faces in some rows leave gains of others, alike in all columns; of views they do not.
+        tolerated = gain**2 * float(weight.sum()) + (leaks if name == "rows" else 0.0)
+        tails += [_in_common(total, weight, p, tolerated) for p in patterns]
         p_values[name] = float(min(1.0, parts * min(tails)))
         if p_values[name] < level:
-            size = float((total[known] / weight[known]).square().mean().sqrt())
+            weight = level_rows.sum(axes)
+            known = weight > 0
+            size = float((level_r.sum(axes)[known] / weight[known]).square().mean().sqrt())
             findings.append(
                 f"the readings of some {name} lie above or below what the volume projects to, "
                 f"{100 * size:.2g} % of intensity (root mean square): "
@@ -280,6 +337,8 @@ def _upper_tail(value: float, degrees: int, noncentrality: float) -> float:
     takes seconds, or fails, at the non-centralities of large scans. There the cube root of χ² is
     normal, to 2e-4 of a probability (Abdel-Aty 1954, Biometrika 41:538).
     """
+    if degrees == 0:
+        return 1.0
     mean = degrees + noncentrality
     if mean > _LARGE:
         variance = 2.0 / 9.0 * (1.0 + noncentrality / mean) / mean
@@ -318,15 +377,105 @@ def _cause(name: str, w: Tensor, wr: Tensor, lines: Tensor, axes: tuple[int, int
     )
 
 
-def _drift(total: Tensor, weight: Tensor) -> tuple[float, int]:
-    """χ² of slow additive changes over the views (a line, and a few harmonics), and its degrees
-    of freedom."""
-    t = torch.linspace(-math.pi, math.pi, total.numel(), dtype=torch.float64)
-    waves = [
-        t / math.pi,
-        *(f(k * t) for k in range(1, _HARMONICS + 1) for f in (torch.cos, torch.sin)),
-    ]
-    patterns = torch.stack(waves)
-    gram = (patterns * weight) @ patterns.T
+def _slow(views: int) -> Tensor:
+    """Slow additive changes over the views, ``(patterns, views)``: a line, and a few harmonics."""
+    t = torch.linspace(-math.pi, math.pi, views, dtype=torch.float64)
+    return torch.stack(
+        [
+            t / math.pi,
+            *(f(k * t) for k in range(1, _HARMONICS + 1) for f in (torch.cos, torch.sin)),
+        ]
+    )
+
+
+def _alike(total: Tensor, weight: Tensor, patterns: Tensor | None) -> tuple[float, int]:
+    """χ² of the gains of views or rows, and its degrees of freedom.
+
+    Args:
+        total: weight times residual of each.
+        weight: of each.
+        patterns: ``(patterns, views)`` that they follow; None: each has its own.
+    """
+    if patterns is None:
+        known = weight > 0
+        return float((total[known].square() / weight[known]).sum()), int(known.sum())
     score = patterns @ total
-    return float(score @ torch.linalg.pinv(gram, hermitian=True) @ score), len(waves)
+    gram = (patterns * weight) @ patterns.T
+    return float(score @ torch.linalg.pinv(gram, hermitian=True) @ score), len(patterns)
+
+
+def _cells_squared(weight: Tensor, name: str) -> Tensor:
+    """Squares of what a gain of each cell, constant over the views, adds to the sum of a view or
+    row of ``(views, rows, columns)``: ``(views, cells)`` or ``(rows, columns)``."""
+    return weight.square().flatten(1) if name == "views" else weight.sum(0).square()
+
+
+def _beside_object(weight: Tensor, r: Tensor, lines: Tensor, name: str) -> tuple[Tensor, Tensor]:
+    """Weights, and weights times what is left of the residual where each view and row has a part
+    of what looks like the object itself; all ``(views, rows, columns)``.
+
+    Voxels end with a slice, an object within it: as it comes nearer to the source in some views,
+    a row sees more of it than of the voxels. In the outermost rows nobody knows where it ends.
+    """
+    if lines.shape[1] == 1:
+        return weight, weight * r
+
+    def total(values: Tensor) -> Tensor:
+        return (weight * values).sum(2, keepdim=True)
+
+    # Gain and part of the object are fitted together; of the gain's information a share is left.
+    power = total(lines.square()).clamp_min(_TINY)
+    pattern = 1.0 - lines * total(lines) / power
+    known = total(pattern.square())
+    gain = total(pattern * r) / known.clamp_min(_TINY)
+    left = r - lines * total(lines * (r - gain)) / power
+    share = known / weight.sum(2, keepdim=True).clamp_min(_TINY)
+    if name == "views":
+        share[:, 1:-1] = 1.0
+        left[:, 1:-1] = r[:, 1:-1]
+    return weight * share, weight * share * left
+
+
+def _in_common(total: Tensor, weight: Tensor, patterns: Tensor | None, tolerated: float) -> float:
+    """Probability that what all columns of a view or row have in common is of noise, or of what
+    voxels leave.
+
+    What a gain does is the same in all columns, what voxels leave is not: its size is seen from
+    what blocks of columns differ by (an analysis of variance), but for a part
+    :data:`COMMON` or :data:`COMMON_SLOW` that neighbouring blocks share.
+
+    Args:
+        total: weight times residual ``(views or rows, columns)``.
+        weight: the same shape.
+        patterns: as of :func:`_alike`.
+        tolerated: χ² that is none.
+    """
+    information = weight.sum(0)
+    blocks = min(_BLOCKS, int((information > 0).sum()) // 2)
+    if blocks < 2:
+        return 1.0
+    # As much information in each.
+    so_far = information.cumsum(0) - information / 2.0
+    at = (so_far / information.sum() * blocks).long().clamp_max(blocks - 1)
+    empty = torch.zeros((len(weight), blocks), dtype=weight.dtype)
+    w, s = (empty.index_add(1, at, v) for v in (weight, total))
+    together, degrees = _alike(s.sum(1), w.sum(1), patterns)
+    if patterns is None:
+        sizes = s.sum(1) / w.sum(1).clamp_min(_TINY)
+        off = s - sizes[:, None] * w
+        apart = float((off.square() / w.clamp_min(_TINY)).sum())
+        others = int((w > 0).sum()) - degrees
+    else:
+        grams = torch.einsum("kv,vb,lv->bkl", patterns, w, patterns)
+        scores = patterns @ s
+        sizes = torch.linalg.pinv(grams.sum(0), hermitian=True) @ scores.sum(1)
+        left = scores.T - grams @ sizes
+        inverse = torch.linalg.pinv(grams, hermitian=True)
+        apart = float(torch.einsum("bk,bkl,bl->", left, inverse, left))
+        others = degrees * (blocks - 1)
+    if degrees == 0 or others <= 0:
+        return 1.0
+    alike = COMMON if patterns is None else COMMON_SLOW
+    ratio = together / degrees / (alike * max(apart / others, 1.0))
+    of_voxels = float(stats.f.sf(ratio, degrees, others))
+    return max(of_voxels, _upper_tail(together, degrees, tolerated))
