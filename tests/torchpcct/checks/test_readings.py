@@ -252,3 +252,21 @@ def test_at_the_edge_the_other_axis_serves_and_then_the_nearest():
     torch.testing.assert_close(full[0, :, 1:], lines[1, :, 1:])
     with pytest.raises(ValueError, match="no live reading is left"):
         interpolate_dead(lines, torch.ones_like(mask), rows=True, most=1.0)
+
+
+def test_logarithms_to_base_ten_are_told_by_how_their_noise_grows():
+    """-560 HU of water without a word; of electronic noise alone the variance grows as exp(2 p)."""
+    lines = np.log(AIR / counted())
+    electronic = counted(air=4e4) + 150.0 * np.random.default_rng(1).standard_normal(SHONE.shape)
+    electronic = np.log(4e4 / np.maximum(electronic, 1.0))
+
+    def said(values):
+        return reading_warnings(Scan.from_line_integrals(values, FAN, mu_water=MU))
+
+    (text,) = said(lines / math.log(10.0))
+    assert re.search(r"grows as exp\(2\.\d p\).*logarithms to base 10", text)
+    for sound in (lines, LINES, electronic, 1.05 * lines, np.maximum(lines, 0.0)):
+        assert said(sound) == []
+    # A bow-tie filter darkens the beam where the object is thin.
+    bowtie = np.exp(-1.5 * np.linspace(-1.0, 1.0, FAN.columns) ** 2)
+    assert said(np.log(AIR * bowtie / np.maximum(counted(SHONE * bowtie), 0.5))) == []

@@ -273,8 +273,17 @@ def test_an_object_that_ends_within_the_outermost_rows_is_no_gain_and_no_wrong_n
     nearer = 0.01 * torch.sin(torch.linspace(0, 6.2, 60, dtype=torch.float64))[:, None, None]
     two, clear, still = lines[:, :2], 25 * W[:, :2], noise(13)[:, :2] / 5
     wide = (1.2 * (1.0 - (U / 14.0) ** 2).sqrt()).expand(60, 2, 24)
-    for body, size in ((two, 1.0), (wide, 0.7)):
-        assert residual_test(still + size * nearer * body, clear, body).findings == ()
+    flat = torch.zeros((60, 2, 24), dtype=torch.float64)
+    flat[..., 4:20] = 0.6
+    beside = torch.zeros_like(flat)
+    beside[..., :4] = 0.7  # what the fit puts there
+    for body, like, size in (
+        (two, two, 1.0),
+        (wide, wide, 0.7),
+        (flat, flat, 1.0),
+        (flat, beside, 0.6),
+    ):
+        assert residual_test(still + size * nearer * like, clear, body).findings == ()
     found = residual_test(still + nearer.expand(60, 2, 24), clear, two).findings
     assert any("some views" in text for text in found)
     # Rows between others of the same object do not see more of it.
