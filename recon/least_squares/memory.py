@@ -18,9 +18,13 @@ if TYPE_CHECKING:
     from torchpcct.projector import Projector
 
 
-VOLUMES = 21
+VOLUMES = 26
 """Arrays of one volume's size that live at once: right-hand side, volume, gradients, two steps with
-their images, the prior's and the transform's temporaries, the spectra of a whole field."""
+their images, the prior's and the transform's temporaries, those of the iterations on the model of a
+whole field."""
+MODEL = 12
+"""Arrays of one volume's size that the model of a whole field holds, whatever the batch: weights
+and spectra of its sectors, and what it was made of."""
 SINOGRAMS = 3
 """Arrays of the data's size besides the arguments: weighted data, projection, their product."""
 
@@ -51,7 +55,8 @@ def pwls_bytes(A: Projector, batch: int, dtype: torch.dtype, device: torch.devic
         if estimate is not None
         else 0
     )
-    return int(inside + item * (VOLUMES * volume + SINOGRAMS * data))
+    model = dtype.itemsize * MODEL * volume
+    return int(inside + model + item * (VOLUMES * volume + SINOGRAMS * data))
 
 
 def require_memory(A: Projector, batch: int, like: Tensor, memory: int | None) -> None:
