@@ -5,7 +5,8 @@ backprojection), :mod:`recon.least_squares` (PWLS; its engine is :mod:`recon.gra
 :mod:`recon.mbir` (unrolled steps with a learned prior). All that PWLS and MBIR see of a scan is
 its :mod:`~recon.data_term`; each method gives :mod:`~recon.result`. Tools:
 :mod:`~recon.conjugate_gradient`, :mod:`~recon.filters` of a volume.
-A geometry from the object itself: :mod:`recon.calibration`. What a method has to beat:
+A geometry from the object itself: :mod:`recon.calibration`; the motion of an inset from its own
+scan: :mod:`recon.motion`. What a method has to beat:
 :mod:`recon.evaluate`. Comparisons: :mod:`recon.study`.
 """
 
@@ -19,12 +20,14 @@ if TYPE_CHECKING:
     from recon.api import reconstruct
     from recon.calibration import calibrate
     from recon.least_squares.pwls import pwls
+    from recon.motion import estimate_motion
     from recon.names import METHODS
 
-__all__ = ["METHODS", "calibrate", "fbp", "pwls", "reconstruct"]
+__all__ = ["METHODS", "calibrate", "estimate_motion", "fbp", "pwls", "reconstruct"]
 
 _SOURCES = {
     "calibrate": "recon.calibration",
+    "estimate_motion": "recon.motion",
     "fbp": "recon.analytic.fbp",
     "pwls": "recon.least_squares.pwls",
     "METHODS": "recon.names",

@@ -99,6 +99,7 @@ def reconstruct(
     *,
     progress: Callable[[float], None] | None = ...,
     device: str | torch.device | None = ...,
+    motion: object = ...,
     **options: Unpack[MethodOptions],
 ) -> Volume: ...
 @overload
@@ -109,6 +110,7 @@ def reconstruct(
     *,
     progress: Callable[[float], None] | None = ...,
     device: str | torch.device | None = ...,
+    motion: object = ...,
     **options: Unpack[MethodOptions],
 ) -> list[Volume]: ...
 
@@ -121,6 +123,7 @@ def reconstruct(
     *,
     progress: Callable[[float], None] | None = None,
     device: str | torch.device | None = None,
+    motion: object = None,
     **options: Unpack[MethodOptions],
 ) -> Volume | list[Volume]:
     """Reconstruct a scan on a grid, in HU (water reads 0).
@@ -146,6 +149,11 @@ def reconstruct(
             CPU all the same: tests and repair of the readings, tests of what a volume leaves of
             them, the fit of an inset's FFT model, and what is drawn of a vessel. All else runs on
             the device, with Triton's kernels.
+        motion: of an inset whose surround is known (``acquire(…, region=)``), which stands still:
+            its displacement in every view, ``(views, 3)`` z, y, x mm; ``"estimate"``: from the
+            readings themselves (:func:`recon.motion.estimate_motion`), with the path, its errors
+            and whether the readings hold it under ``motion`` in the report, scan by scan; or what
+            that found. The volume shows the inset at rest, where its displacement is zero.
         options: of the method (:class:`MethodOptions`).
 
     Readings that no object can cause (dead or hot cells, dead views, lost readings:
@@ -171,7 +179,8 @@ def reconstruct(
     Raises:
         ValueError: an unknown method, kernel or option value, a grid outside the field of view, a
             starved scan; a device that does not exist, has too little memory, or has no kernels for
-            the scan; scans or a ``problem`` on another device.
+            the scan; scans or a ``problem`` on another device; a motion of another shape, beside a
+            ``problem``, or of a scan whose motion cannot be found.
         TypeError: ``scan`` is no :class:`torchpcct.Scan`, or an option does not exist.
 
     Example:
@@ -193,6 +202,9 @@ def reconstruct(
         )
     if not isinstance(grid, VolumeGrid) or (grid.ndim != 3 and scans[0].geometry.has_rows):
         raise ValueError(f"grid must be a (z, y, x) VolumeGrid, got {grid!r}")
+    if motion is not None and not isinstance(scan, Scan):
+        given: dict[str, Any] = {"progress": progress, "device": device, "motion": motion}
+        return [reconstruct(s, grid, method, **given, **options) for s in scans]
     there = _device(scans, device)
     for s in scans:
         require_light(s.zero_fraction)
@@ -220,13 +232,17 @@ def reconstruct(
     volumes: list[Volume] = []
     logged: set[str] = set()
     began = time.perf_counter()
+    moves: dict[str, Any] = {}
+    if motion is not None:
+        said, moves = _moving(motion, name, scans[0], grid, chosen)
+        whole = [(s, [*texts, *said]) for s, texts in whole]
     found_of = methods[name](scans, grid, progress or (lambda _: None), **chosen)
     for batch in _within_memory(found_of, there):
         seconds = round((time.perf_counter() - began) / len(batch), 3)
         for solution in batch:
             s, before = whole[len(volumes)]
             volume, report, found = _finished(s, grid, solution)
-            report |= {
+            report |= moves | {
                 "seconds": seconds,
                 "cells_mm": finite_cells(s.geometry),
                 "dead_readings": dead_readings(s),
@@ -241,6 +257,39 @@ def reconstruct(
             volumes.append(Volume(volume, grid, report, unit=s.unit))
         began = time.perf_counter()
     return volumes[0] if isinstance(scan, Scan) else volumes
+
+
+def _moving(
+    motion: object, method: str, scan: Scan, grid: VolumeGrid, chosen: dict[str, Any]
+) -> tuple[list[str], dict[str, Any]]:
+    """Put the inset's path into the options of a method; what is to be said of it, and reported."""
+    from recon.motion import path_of
+
+    if chosen.get("problem") is not None:
+        raise ValueError(
+            "a problem stands beside motion: give problem.with_motion(path), or motion alone"
+        )
+    if scan.window is None:
+        raise ValueError(
+            "motion needs the surround of the inset, which stands still: acquire the scan with "
+            "region="
+        )
+    path, found = path_of(motion, _here(scan), grid)
+    said, report = ([], {}) if found is None else (found.warnings, {"motion": found.report()})
+    if found is not None and not found.held:
+        return said, report
+    if method == "fbp":
+        chosen["motion"] = path
+        return said, report
+    from recon.least_squares.inset_problem import InsetProblem
+
+    if method == "mbir":
+        from recon.mbir.mbir import Mbir, working_grid
+
+        chosen["network"] = chosen.get("network") or Mbir.load()
+        grid = working_grid(grid, chosen["network"].voxel_mm)
+    chosen["problem"] = InsetProblem(scan, grid).with_motion(path)
+    return said, report
 
 
 def _device(scans: Sequence[Scan], device: str | int | torch.device | None) -> torch.device:
@@ -340,13 +389,14 @@ def _fbp(
     progress: Callable[[float], None],
     *,
     kernel: str = "standard",
+    motion: object = None,
 ) -> Iterator[list[Result]]:
     if not isinstance(kernel, str):
         raise TypeError(
             f"kernel must be one name, got {kernel!r}; recon.analytic.inset.InsetFbp takes "
             "several at once"
         )
-    run = InsetFbp(scans[0], [grid], [kernel])
+    run = InsetFbp(scans[0], [grid], [kernel], motion=motion)
     warnings, notes = [*run.warnings, *sampling_warnings(run.circle)], view_notes(run.circle)
     report = {"method": "fbp", "kernel": kernel, **({"notes": notes} if notes else {})}
     for i, s in enumerate(scans):

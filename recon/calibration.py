@@ -29,9 +29,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional as F
 
 from recon.analytic.fbp import fbp
+from recon.variable_projection import normal_equations, products, smoothed_cells
 from torchpcct.checks.defects import repair_defects
 from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector.posed import PosedEngine
@@ -61,9 +61,6 @@ FREE: Mapping[str, str] = {
 _TIMES = 4
 """How often what a volume explains is taken off, beside the first time: of a first approximation a
 cone beam's offset is 0.7 columns off, of the second 0.17, of the third 0.08 (48 rows, ±11°)."""
-_BLUR_CELLS = 1.5
-"""Standard deviation of the smoothing over cells: of a voxel edge 4 % is left, of the shadows'
-shifts a quarter."""
 _LEAST_SHARE = 0.05
 """Of a number's effect on the readings that no volume explains, below which it is refused."""
 _LARGEST_COLUMNS = 1.0
@@ -308,11 +305,6 @@ class _Problem:
         turns = {n: math.radians(_LARGEST_DEGREES) for n, unit in FREE.items() if unit == "°"}
         self.limits = np.array([{**largest, **turns}[n] for n in names])
 
-    def _blurred(self, readings: Tensor) -> Tensor:
-        """``(…, *geometry.shape)`` smoothed over cells; the outermost are repeated, which is
-        nearly its own transpose where readings end in air."""
-        return _filtered(readings, _kernel(readings), self.cells)
-
     def start(self) -> Floats:
         own = {
             "offset": self.base.column_offset,
@@ -373,30 +365,24 @@ class _Problem:
             # Of a smoother volume: its noise must not be taken for edges that move.
             plain = engine.derivatives(volume(self.lines, "soft"), self._tangents(values))
             both = left(torch.cat([plain, rest]))
-            effects, rest = self._blurred(torch.stack([plain, both[:-1]])), both[-1:]
+            effects, rest = smoothed_cells(torch.stack([plain, both[:-1]]), self.cells), both[-1:]
         else:
             rest = left(rest)
-        plain, own, rest = effects[0], effects[1], self._blurred(rest)
-        known = w > 0
-        variance = 1.0 / torch.where(known, w, w[known].mean())
-        information = _products(own * w, own)
-        shares = np.diag(information) / np.maximum(np.diag(_products(plain * w, plain)), 1e-300)
+        plain, own, rest = effects[0], effects[1], smoothed_cells(rest, self.cells)
+        # of the noise, a volume has explained a part
+        found = normal_equations(own, rest, w, self.cells, left if errors else None)
+        information = found.information
+        shares = np.diag(information) / np.maximum(np.diag(products(plain * w, plain)), 1e-300)
         scaled = np.sqrt(np.maximum(np.diag(information), 1e-300))
         # In units of each number's own error: what is singular is singular whatever the unit.
         unit = information / np.outer(scaled, scaled)
         inverse = np.linalg.pinv(unit, rcond=1e-8, hermitian=True) / np.outer(scaled, scaled)
-        step = inverse @ _products(own * w, rest)[:, 0]
-        # Noise of the step: the readings' noise, of which a volume has explained a part, blurred.
-        noisy = self._blurred(own * w)
-        if errors:  # of the noise, a volume has explained a part
-            noisy = left(noisy * variance * known) * w
-        noise = inverse @ _products(noisy * variance, noisy) @ inverse
+        step = inverse @ found.pull
+        noise = inverse @ found.spread @ inverse
         spread = np.sqrt(np.maximum(np.diag(noise), 0.0))
         if np.linalg.matrix_rank(unit, tol=1e-6, hermitian=True) < len(unit):
             spread = np.full(len(unit), math.inf)
-        quiet = _filtered(variance, _kernel(w).square(), self.cells)
-        misfit = math.sqrt(float((rest[0].square() / quiet)[known].double().mean()))
-        return _State(effects, step, spread, shares, information, misfit)
+        return _State(effects, step, spread, shares, information, found.misfit)
 
     def require_determined(self, state: _State) -> None:
         """Refuse numbers that the readings do not determine (ValueError)."""
@@ -425,28 +411,3 @@ class _Problem:
             "be more than a column, 2° or 3 % of sdd. Leave it out of free, or scan with more "
             "photons"
         )
-
-
-def _products(a: Tensor, b: Tensor) -> Floats:
-    """Inner products ``(n, m)`` of readings ``(n, …)`` and ``(m, …)``."""
-    return (a.double().flatten(1) @ b.double().flatten(1).T).numpy()
-
-
-def _kernel(like: Tensor) -> Tensor:
-    reach = math.ceil(3 * _BLUR_CELLS)
-    at = torch.arange(-reach, reach + 1, dtype=like.dtype)
-    values = torch.exp(-0.5 * (at / _BLUR_CELLS) ** 2)
-    return values / values.sum()
-
-
-def _filtered(readings: Tensor, kernel: Tensor, cells: int) -> Tensor:
-    """Filtered along the last ``cells`` axes."""
-    reach = kernel.numel() // 2
-    out = readings
-    for axis in range(readings.dim() - cells, readings.dim()):
-        moved = out.movedim(axis, -1)
-        flat = moved.reshape(-1, 1, moved.shape[-1])
-        padded = F.pad(flat, (reach, reach), mode="replicate")
-        done = F.conv1d(padded, kernel.view(1, 1, -1))
-        out = done.reshape(moved.shape).movedim(-1, axis)
-    return out

@@ -644,6 +644,10 @@ def _note(path: Path) -> JsonObject:
 def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     options, method = _method_options(arguments), _method(arguments)
     slabs = arguments.memory is not None
+    if arguments.motion is not None:
+        if slabs:
+            raise ValueError("--memory works slab by slab, without --motion: leave out one of them")
+        options["motion"] = arguments.motion
     if arguments.out is None:
         arguments.out = Path(
             f"{without_ending(arguments.scan)}_{method}.nii{'' if slabs else '.gz'}"
@@ -896,6 +900,14 @@ def add_reconstruct(commands: Commands) -> None:
             ("Z", "Y", "X"),
             "with --tissues: where a reader sees the plaque, mm",
             {"nargs": 3, "limits": PLACE},
+        ),
+        (
+            "--motion",
+            str,
+            None,
+            "estimate: find the rigid motion of an inset (a scan with region) from its readings, "
+            "and take it out; the path with its errors is in the report",
+            {"choices": ["estimate"]},
         ),
         group="method",
     )

@@ -8,7 +8,7 @@ way during the view: no phase volumes.
 
 Beyond the paper: reconstruction with the motion known (FBP, penalised least squares and the learned
 MBIR, each with the displaced inset in its backprojector or projector), with the motion known
-wrongly, and with noise.
+wrongly, with the motion estimated from the scan itself (:mod:`recon.motion`), and with noise.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from recon.analytic.inset import view_motion
@@ -28,7 +29,9 @@ from recon.jobs.store import Pieces
 from recon.least_squares.inset_problem import InsetProblem
 from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.mbir.mbir import Mbir
+from recon.motion import estimate_motion
 from recon.study.figures import curve_axes, middle_panel, plaque_panel
+from recon.study.motion_found import CASES, found_paths
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import (
     SCANNERS,
@@ -49,7 +52,7 @@ from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.scene import Scene
 from torchpcct.scene.motion import SinusoidalMotion
 from torchpcct.scene.plaque import Plaque, plaque_scene
-from torchpcct.validate import number
+from torchpcct.validate import choice, number
 from torchpcct.viz import WINDOW_HU, Panel, panels
 
 if TYPE_CHECKING:
@@ -73,9 +76,12 @@ _PWLS_TOLERANCE_HU = 2.0
 _ERROR_WIDTH_HU = 200.0
 """Window of the error maps, about 0 HU, as in the paper."""
 
-Key = tuple[str, float | None, bool]
-"""Method, error of the estimated motion (0: the true one; None: the still vessel), whether there
-is noise."""
+ESTIMATED = "estimated"
+"""In the place of an error: the motion estimated from the scan."""
+
+Key = tuple[str, float | str | None, bool]
+"""Method, error of the assumed motion (0: the true one; None: the still vessel; :data:`ESTIMATED`),
+whether there is noise."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +102,10 @@ class MotionSettings(StudySettings):
         exposure_s: of the noisy reconstructions.
         seed, realizations: of their noise; realisation i uses ``seed + i``.
         methods: of the compensation, of ``"fbp"`` (always), ``"pwls"``, ``"mbir"``.
+        found_mm: amplitudes of the motions that are estimated from the scan itself, mm.
+        found_exposures_s: exposures of these estimates.
+        found_cases: of :data:`recon.study.motion_found.CASES`.
+        found_draws: noise realisations of each.
     """
 
     thinning: int = 1
@@ -111,6 +121,10 @@ class MotionSettings(StudySettings):
     seed: int = 0
     realizations: int = 2
     methods: tuple[str, ...] = tuple(METHODS)
+    found_mm: tuple[float, ...] = (0.2, 0.4, 0.8, 1.2, 2.0)
+    found_exposures_s: tuple[float, ...] = (2.0, 0.35)
+    found_cases: tuple[str, ...] = tuple(CASES)
+    found_draws: int = 5
 
     # An eighth of the views, four residual motions, one error of the estimate, no PWLS.
     QUICK: ClassVar[dict[str, object]] = {
@@ -119,10 +133,17 @@ class MotionSettings(StudySettings):
         "errors": (0.10,),
         "realizations": 1,
         "methods": ("fbp", "mbir"),
+        "found_mm": (0.4, 1.2),
+        "found_draws": 1,
     }
 
     def __post_init__(self) -> None:
-        self.check_whole(thinning=1, realizations=1, seed=0)
+        self.check_whole(thinning=1, realizations=1, seed=0, found_draws=1)
+        for case in self.found_cases:
+            choice("found_cases", case, tuple(CASES))
+        for name in ("found_mm", "found_exposures_s"):
+            for value in getattr(self, name):
+                number(name, value, positive=True)
         for name in ("amplitude_mm", "rate_bpm", "rotation_s", "voxel_mm", "exposure_s"):
             number(name, getattr(self, name), positive=True)
         for name in ("fractions", "eid_fractions", "errors"):
@@ -195,7 +216,9 @@ def measure(
             m.compensated = compensate(
                 s, still, moving, reference, pieces.within("compensation"), advance
             )
+    paths = pieces.within("found")
     data |= {
+        "found": found_paths(s, reference.grid, paths, partial(progress, "estimates")),
         "at_rest": {name: o.measures for name, o in m.at_rest.items()},
         "residual": [
             {"scanner": name, "fraction": f, "in_place": here.measures, "moved_back": back.measures}
@@ -302,14 +325,14 @@ def compensate(
     realisations.
 
     PWLS, whose solution is to be certified by exact projections, is run without noise and for the
-    first noise realisation, at rest and with the true motion; FBP and MBIR with every estimate of
-    the motion. One entry per realisation.
+    first noise realisation, at rest and with the true motion; FBP and MBIR with every assumed
+    motion and with that estimated from the scan. One entry per realisation.
     """
     grid = reference.grid
     path = view_motion(s.motion.scaled(s.worst), moving.geometry, s.rotation_s)
-    estimates: dict[float | None, Floats | None] = {None: None}
+    estimates: dict[float | str | None, Floats | None] = {None: None}
     estimates |= {e: (1.0 - e) * path for e in (0.0, *s.errors)}
-    problems: dict[float | None, InsetProblem] = {}
+    problems: dict[float | str | None, InsetProblem] = {}
     if set(s.methods) - {"fbp"}:
         problem = InsetProblem(still, grid)
         problems = {
@@ -318,7 +341,7 @@ def compensate(
         }
     network = Mbir.load() if "mbir" in s.methods else None
 
-    def reconstruct(method: str, scan: Scan, error: float | None) -> Tensor:
+    def reconstruct(method: str, scan: Scan, error: float | str | None) -> Tensor:
         if method == "fbp":
             return reference_fbp(scan, grid, estimates[error])
         if network is None or method == "pwls":
@@ -341,6 +364,11 @@ def compensate(
             scan if seed is None else scan.with_noise(s.exposure_s, seed)
             for scan in (still, moving)
         ]
+        # Where the vessel is on average no scan tells: in the place of the true mean.
+        seen = pieces(f"path_{seed}", partial(_estimated, scans[1], grid))
+        estimates[ESTIMATED] = seen.numpy() + path.mean(0)
+        if problems:
+            problems[ESTIMATED] = problems[None].with_motion(estimates[ESTIMATED])
         for method in s.methods:
             for error in estimates:
                 if method == "pwls" and (k > 1 or error):
@@ -354,6 +382,10 @@ def compensate(
                 )
         progress((k + 1) / len(noise))
     return found
+
+
+def _estimated(scan: Scan, grid: VolumeGrid) -> Tensor:
+    return torch.from_numpy(estimate_motion(scan, grid).path)
 
 
 # --- the report -----------------------------------------------------------------------------------
@@ -392,7 +424,7 @@ def _borne(data: JsonObject) -> JsonObject:
 
     estimates: dict[str, list[JsonObject]] = {}
     for c in data["compensated"]:
-        if not c["noisy"] and c["error"] is not None:
+        if not c["noisy"] and c["error"] not in (None, ESTIMATED):
             estimates.setdefault(c["method"], []).append(c["realizations"][0])
     whole = {name: found for name, found in estimates.items() if len(found) == len(errors)}
     return {
@@ -481,10 +513,12 @@ def _images(m: Found) -> Figure:
     rows: list[list[Panel]] = []
     labels = []
 
-    def title_of(error: float | None) -> str:
+    def title_of(error: float | str | None) -> str:
         return (
             "at rest"
             if error is None
+            else "estimated motion"
+            if isinstance(error, str)
             else f"wrong by {100 * error:.0f} %"
             if error
             else "true motion"

@@ -54,6 +54,10 @@ TINY: dict[str, dict[str, Any]] = {
         "realizations": 1,
         "exposure_s": 20.0,
         "methods": ("fbp", "pwls"),
+        "found_cases": ("along x",),
+        "found_mm": (1.2,),
+        "found_exposures_s": (2.0,),
+        "found_draws": 1,
     },
     "noise": {
         "realizations": 24,

@@ -6,7 +6,7 @@ import pytest
 from plaque_image import tissue_volume
 from tiny_studies import assert_report_is_whole
 
-from recon.study.motion import Reference, observe
+from recon.study.motion import ESTIMATED, Reference, observe
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct.scene.plaque import plaque_scene
 
@@ -47,6 +47,8 @@ def test_motion_spoils_and_its_knowledge_repairs(tiny):
     fixed = m.compensated["fbp", 0.0, False][0]
     assert fixed["nrmse"] < 0.1 * large[0]["nrmse"]
     wrong = m.compensated["fbp", 0.2, False][0]
+    estimated = m.compensated["fbp", ESTIMATED, False][0]
+    assert estimated["nrmse"] < wrong["nrmse"]
     assert fixed["nrmse"] < wrong["nrmse"] < large[0]["nrmse"]
     # An estimate that is wrong by a fifth leaves a fifth of the motion.
     assert wrong["nrmse"] == pytest.approx(small[0]["nrmse"], rel=0.15)
@@ -73,7 +75,10 @@ def test_report(tiny, tmp_path):
     assert "segmentation finds it" in study.report.text
     assert {"range [0, A]", "EID-CT less sensitive"} <= {c["paper"] for c in data["checks"]}
     assert len(data["residual"]) == 3
-    assert len(data["compensated"]) == 10
+    assert len(data["compensated"]) == 12
+    found = data["found"][0]
+    assert found["held"] == 1
+    assert found["error_mm"] < 0.2 * found["true_mm"]
     first = data["residual"][0]["in_place"]
     here = study.measured.seen.residual["PCCT", 0.2][0]
     assert (first["nrmse"], first["lumen_mm2"]) == (here["nrmse"], here["lumen_mm2"])

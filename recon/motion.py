@@ -1,0 +1,558 @@
+"""Motion of an inset, estimated from its own scan, with an interval and a test.
+
+What lies in the inset moves rigidly along a smooth path; its surround is known and stands still.
+The path is found together with the volume by variable projection
+(:mod:`recon.variable_projection`): FBP along the present path gives the volume, the derivatives of
+its projections by the displacement in every view are what the path does to the readings, and what
+another volume would explain of them is taken off.
+
+**Start.** The centre of mass of what is left when the surround is taken off moves on the detector
+as the inset does, whatever the inset looks like (the first of the consistency conditions of
+Helgason and Ludwig). A path fitted to it does not sit in the local minimum of no motion.
+
+**What a turn holds.** A view sees the displacement across its rays, not along them. What a path
+does along the rays of every view is told by its smoothness alone: a Gaussian prior on speed and
+acceleration, of a size that the readings choose (marginal likelihood, MacKay 1992, Neural Comput.
+4:415). A constant displacement is another volume; the path's mean is zero.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+from torch import Tensor
+
+from recon.analytic.fbp import FbpPlan
+from recon.variable_projection import Normal, normal_equations, smoothed_cells
+from torchpcct.detector_window import DetectorWindow, footprint
+from torchpcct.geometry import ConeBeam, VolumeGrid
+from torchpcct.projector import Projector, with_parameters
+from torchpcct.projector.posed import PosedEngine
+from torchpcct.scan import Scan
+from torchpcct.validate import checked, number
+from torchpcct.vector_geometry import check_motion
+
+__all__ = ["InsetMotion", "estimate_motion", "path_of"]
+
+_LOG = logging.getLogger(__name__)
+Floats = NDArray[np.float64]
+
+_VIEWS = 96
+"""Views that neighbouring ones are averaged to: an inset of 5 mm then turns by 0.16 mm at its edge
+within one."""
+_LEAST_VIEWS = 48
+"""Fewer views a turn leave streaks that pass for motion."""
+_VOXEL_CELLS = 2.0
+"""Voxel of the working grid in cells as they are seen at the inset."""
+_INTERVALS = 4
+"""Of the cubic spline in a scan; a coefficient per axis for each, and three more."""
+_HARMONICS = 2
+"""Of the heart's rate, if that is given."""
+_REACH_MM = 2.5
+"""Largest displacement from the mean that is looked for."""
+_TIMES = 2
+"""How often what a volume explains is taken off, beside the first time."""
+_STEPS = 6
+_SETTLED = 0.5
+"""Change of the path in the last step over its standard error, root mean squares."""
+_NEAR_MM = 0.05
+"""Change below which the effects of the path are not computed again."""
+_LARGEST_STEP_MM = 0.7
+"""Of one iteration."""
+_SPEED = 3.0
+_BEND = 6.0
+"""Of the prior of a path over a scan, relative: speeds (1 / scan) and their changes (1 / scan²)."""
+_LEAST_MM = 0.003
+"""Of the prior's scale along any axis."""
+_ROUNDS = 60
+"""Of expectation maximisation."""
+_SMOOTH_VOXELS = 1.0
+"""Standard deviation by which the volume is smoothed before its effects are computed."""
+_NOISES = 3.0
+"""Voxels of no more than so many times their noise have no effect."""
+_MODEL = 1.8
+"""White noise that does to the path what errors of the model do (voxels, the cone's missing data),
+over the readings' root mean square; of the paper's plaque, 96 averaged views."""
+_LEAST_EVIDENCE = 6.0
+"""Logarithm of the marginal likelihood's ratio to rest, from which on a motion is believed."""
+_FLOOR_MM = 0.02
+"""Root mean square path below which voxels and averaged views are as likely its cause."""
+_LEFT_NOISE = 1.17
+_LEFT_MODEL = 0.014
+"""What noise, and errors of the model over the mean square of the readings, leave of the smoothed
+readings, in units of their noise's variance; of the paper's plaque."""
+_ANOTHER = 1.4
+"""Times that, from which on something else moves."""
+
+
+@dataclass(frozen=True)
+class InsetMotion:
+    """Result of :func:`estimate_motion`.
+
+    Attributes:
+        path: ``(views, 3)`` z, y, x mm, displacement of the inset in every view of the scan, of
+            mean zero; zeros if no motion is held.
+        errors: ``(views, 3)`` standard errors of the path that was found, applied or not.
+        held: whether the readings hold a motion.
+        evidence: logarithm of the marginal likelihood of the motion over that of rest.
+        rms_mm: root mean square displacement of the path that was found, applied or not.
+        misfit: what is left of the smoothed readings over their noise, root mean square, at rest
+            and along ``path``.
+        steps: iterations done.
+        warnings: what restrains trust in the result.
+    """
+
+    path: Floats
+    errors: Floats
+    held: bool
+    evidence: float
+    rms_mm: float
+    misfit: tuple[float, float]
+    steps: int
+    warnings: list[str] = field(default_factory=list)
+
+    def report(self) -> dict[str, Any]:
+        """All numbers, for JSON."""
+        return {
+            "held": self.held,
+            "rms_mm": self.rms_mm,
+            "evidence": self.evidence,
+            "misfit": list(self.misfit),
+            "steps": self.steps,
+            "path_mm": np.round(self.path, 4).tolist(),
+            "errors_mm": np.round(self.errors, 4).tolist()
+            if np.isfinite(self.errors).all()
+            else None,
+        }
+
+
+class _Problem:
+    """The readings of an inset, and what volumes that move leave of them.
+
+    Attributes:
+        basis: ``(views, k)`` of mean zero, of the scan's views; independent standard normal
+            coefficients are the prior of a path of 1 mm², mean square, along one axis.
+    """
+
+    def __init__(self, scan: Scan, grid: VolumeGrid, rate: float | None) -> None:
+        geometry: Any = scan.geometry
+        self._noise_free = scan.noise_free
+        region = grid if scan.region is None else scan.region
+        spacing = max(_VOXEL_CELLS * geometry.cell, *grid.spacing)
+        self.grid = VolumeGrid(
+            tuple(max(1, math.ceil(e / spacing - 1e-6)) for e in region.extent),
+            spacing,
+            region.center,
+        )
+        angles = np.unwrap(geometry.angles)
+        groups = np.array_split(np.arange(geometry.views), min(_VIEWS, geometry.views))
+        self._averaging = _averages(groups, geometry.views)
+        self.geometry = replace(geometry, angles=self._averaging @ angles)
+        self.basis = _basis((angles - angles[0]) / (angles[-1] - angles[0]), rate)
+        self._few = self._averaging @ self.basis
+        self.window = self._window()
+        window = scan.window
+        assert window is not None
+        around = window.take(scan.surround_line_integrals())
+        place, here = (_centre_columns(g, self.grid) for g in (geometry, self.geometry))
+        shift = place - self._averaging.astype(bool).T @ here
+
+        def averaged(values: Tensor, beyond: float | None, total: bool) -> Tensor:
+            found = _aligned(values, window, self.window, groups, shift, beyond)
+            counts = torch.tensor([len(g) for g in groups], dtype=found.dtype)
+            return found * counts.view(-1, 1, 1) if total else found
+
+        self.lines = averaged(scan.line_integrals().float() - around.float(), 0.0, False)
+        self.weights = averaged(window.take(scan.surround_weights()).float(), None, True)
+
+    def _window(self) -> DetectorWindow:
+        """The readings of the working grid wherever it may be."""
+        g = self.geometry
+        paths = [np.zeros(3)]
+        paths += [sign * _REACH_MM * np.eye(3)[axis] for axis in (1, 2) for sign in (-1, 1)]
+        windows = [footprint(g, self.grid, 1, np.tile(p, (g.views, 1))) for p in paths]
+        return DetectorWindow.union(windows, g.columns)
+
+    @cached_property
+    def signal(self) -> float:
+        """Mean square of the inset's readings over their noise's."""
+        found = float((self.lines.double().square() * self.weights).mean())
+        return max(0.0, found - (0.0 if self._noise_free else 1.0))
+
+    @property
+    def inflation(self) -> float:
+        """Variance of noise and model over that of noise alone, as the path meets it."""
+        return 1.0 + _MODEL**2 * self.signal
+
+    def errors(self, covariance: Floats) -> Floats:
+        """Standard errors ``(views, 3)`` mm of a path."""
+        k = self.basis.shape[1]
+        blocks = [covariance[a * k : (a + 1) * k, a * k : (a + 1) * k] for a in range(3)]
+        variances = [np.einsum("vi,ij,vj->v", self.basis, b, self.basis) for b in blocks]
+        return np.sqrt(np.maximum(np.stack(variances, 1), 0.0))
+
+    def start(self) -> Floats:
+        """Coefficients ``(k, 3)`` from the centres of mass of the readings."""
+        g, (rows, columns) = self.geometry, self.window.shape[1:]
+        y, w = (v.double().numpy() for v in (self.lines, self.weights))
+        mass = y.sum((1, 2))
+        if not abs(mass.mean()) > 3.0 * math.sqrt((1.0 / w).sum((1, 2)).mean() / len(mass)):
+            return np.zeros((self._few.shape[1], 3))
+        mass = np.full_like(mass, mass.mean())
+        at_column = (
+            self.window.first_column[:, None] - _centre_columns(g, self.grid)[:, None]
+        ) + np.arange(columns)
+        at_row = np.arange(rows) - (rows - 1) / 2
+        cy, cx = self.grid.center[-2:]
+        away = np.stack([cx - g.sod * np.cos(g.angles), cy - g.sod * np.sin(g.angles)], 1)
+        distance = np.linalg.norm(away, axis=1)
+        # Across the ray to the inset, along growing columns; (views, 3) z, y, x.
+        across = np.stack([0 * distance, -away[:, 0], away[:, 1]], 1) / distance[:, None]
+        sides = (
+            (at_column[:, None, :], g.column_pitch, across),
+            (at_row[None, :, None], g.row_pitch, np.tile([1.0, 0.0, 0.0], (len(mass), 1))),
+        )
+        left, right = [], []
+        for at, pitch, direction in sides:
+            to_mm = pitch * distance / g.sdd
+            centre = (y * at).sum((1, 2)) / mass * to_mm
+            noise = np.sqrt((np.broadcast_to(at, y.shape) ** 2 / w).sum((1, 2))) / mass * to_mm
+            moved = direction[:, :, None] * self._few[:, None, :]  # (views, 3, k)
+            rows_of = np.concatenate([moved.reshape(len(mass), -1), 10.0 * direction], 1)
+            left.append(rows_of / np.abs(noise)[:, None])
+            right.append(centre / np.abs(noise))
+        a, b = np.concatenate(left), np.concatenate(right)
+        found = np.linalg.solve(a.T @ a + np.eye(a.shape[1]), a.T @ b)
+        return found[:-3].reshape(3, -1).T
+
+    def path(self, coefficients: Floats) -> Floats:
+        """``(views, 3)`` mm in the views of the scan."""
+        return self.basis @ coefficients
+
+    def at(self, coefficients: Floats, effects: Tensor | None = None) -> tuple[Normal, Tensor]:
+        """Equations for what is to be added to the coefficients, axis by axis, and the effects;
+        ``effects``: of another state nearby, which are not computed again."""
+        motion = np.ascontiguousarray(self._few @ coefficients)
+        engine = Projector(self.geometry, self.grid, self.window, motion)
+        sharp, soft = (
+            FbpPlan(self.geometry, [self.grid], k, motion=motion, window=self.window)
+            for k in ("ram-lak", "soft")
+        )
+
+        def volume(plan: FbpPlan, lines: Tensor) -> Tensor:
+            return plan.backprojected(plan.filtered(lines, held=self.window))[0]
+
+        def left(lines: Tensor) -> Tensor:
+            for _ in range(_TIMES + 1):
+                lines = lines - engine(volume(sharp, lines))
+            return lines
+
+        rest = smoothed_cells(left(self.lines[None]), 2)
+        if effects is None:
+            posed = PosedEngine(
+                with_parameters(self.geometry), self.grid, self.window, torch.from_numpy(motion)
+            )
+            # Source and detector move against the inset.
+            tangents = torch.zeros(3, self.geometry.views, 4, 3, dtype=torch.float64)
+            for axis in range(3):
+                tangents[axis, :, :2, 2 - axis] = -1.0
+            # Of a smoother volume: its noise must not be taken for edges that move.
+            moved = posed.derivatives(_quiet(volume(soft, self.lines)), tangents)
+            over_time = torch.from_numpy(self._few.T.astype(np.float32))[None, :, :, None, None]
+            effects = smoothed_cells(left((moved[:, None] * over_time).flatten(0, 1)), 2)
+        return normal_equations(effects, rest, self.weights, 2), effects
+
+
+def _quiet(volume: Tensor) -> Tensor:
+    """Smoothed, and what is no more than its noise shrunk to nothing (non-negative garrote; Breiman
+    1995, Technometrics 37:373): effects of noise would be found again in the readings' noise."""
+    soft = torch.from_numpy(gaussian_filter(volume.numpy(), _SMOOTH_VOXELS, mode="nearest"))
+    noise = soft.abs().median() / 0.6745
+    return soft * (1.0 - (_NOISES * noise / soft.abs().clamp_min(1e-12)).square()).clamp_min(0.0)
+
+
+def _basis(times: Floats, rate: float | None) -> Floats:
+    """Of paths over ``times`` 0…1, or of harmonics of ``rate`` per scan: ``(views, k)``."""
+    fine = np.linspace(0.0, 1.0, 401)
+    if rate is None:
+        from scipy.interpolate import BSpline
+
+        knots = np.concatenate([[0.0] * 3, np.linspace(0, 1, _INTERVALS + 1), [1.0] * 3])
+        spline = BSpline(knots, np.eye(_INTERVALS + 3), 3)
+        given, speed, bend = spline(times), spline(fine, 1), spline(fine, 2)
+    else:
+        turns = 2.0 * math.pi * rate * np.arange(1, _HARMONICS + 1)
+
+        def waves(order: int, t: Floats) -> Floats:
+            late = order * math.pi / 2
+            phase = t[:, None] * turns + late
+            return np.concatenate([np.cos(phase), np.sin(phase)], 1) * np.tile(turns**order, 2)
+
+        given, speed, bend = waves(0, times), waves(1, fine), waves(2, fine)
+    given = given - given.mean(0)
+    cost = (speed.T @ speed / _SPEED**2 + bend.T @ bend / _BEND**2) / len(fine)
+    # A constant costs nothing and does nothing.
+    values, vectors = np.linalg.eigh(cost)
+    kept = values > 1e-9 * values[-1]
+    white = given @ (vectors[:, kept] / np.sqrt(values[kept]))
+    return white / math.sqrt((white**2).sum(1).mean())
+
+
+def _averages(groups: list[NDArray[np.int64]], views: int) -> Floats:
+    """``(groups, views)``, the mean over each group."""
+    found = np.zeros((len(groups), views))
+    for k, group in enumerate(groups):
+        found[k, group] = 1.0 / len(group)
+    return found
+
+
+def _centre_columns(geometry: Any, grid: VolumeGrid) -> Floats:
+    """Where the middle of a grid falls in every view, in columns."""
+    cy, cx = grid.center[-2:]
+    c, s = np.cos(geometry.angles), np.sin(geometry.angles)
+    across, depth = cy * c - cx * s, geometry.sod - cx * c - cy * s
+    curved = geometry.detector == "curved"
+    at = geometry.sdd * (np.arctan2(across, depth) if curved else across / depth)
+    return np.asarray((at - geometry.column_positions[0]) / geometry.column_pitch)
+
+
+def _aligned(
+    values: Tensor,
+    held: DetectorWindow,
+    wanted: DetectorWindow,
+    groups: list[NDArray[np.int64]],
+    shift: Floats,
+    beyond: float | None,
+) -> Tensor:
+    """Means over groups of views, each moved along the columns so that what lies at the grid's
+    middle stays in place.
+
+    Args:
+        values: ``(views, rows, columns)`` on ``held``.
+        wanted: the window of the means, one view a group; its rows are among those held.
+        shift: ``(views,)`` columns.
+        beyond: value of what is not held; None: of its neighbour.
+    """
+    row = wanted.first_row - held.first_row
+    kept = values[:, row : row + wanted.rows]
+    out = values.new_zeros(len(groups), wanted.rows, wanted.columns)
+    for k, group in enumerate(groups):
+        for view in group:
+            at = wanted.first_column[k] + shift[view] - held.first_column[view]
+            first, part = math.floor(at), at - math.floor(at)
+            columns = first + torch.arange(wanted.columns + 1)
+            inside = (columns >= 0) & (columns < held.columns)
+            found = kept[view][:, columns.clamp(0, held.columns - 1)]
+            if beyond is not None:
+                found = torch.where(inside, found, beyond)
+            out[k] += (1.0 - part) * found[:, :-1] + part * found[:, 1:]
+        out[k] /= len(group)
+    return out
+
+
+@dataclass(frozen=True)
+class _Belief:
+    """What the readings and the prior say of the coefficients ``(k, 3)``, flattened axis by axis.
+
+    Attributes:
+        mean, covariance: of the coefficients.
+        evidence: logarithm of the marginal likelihood over that of rest.
+    """
+
+    mean: Floats
+    covariance: Floats
+    evidence: float
+
+
+def _believed(found: Normal, at: Floats, inflation: float) -> _Belief:
+    """The coefficients under a normal prior whose covariance between axes the readings choose
+    (expectation maximisation of the marginal likelihood).
+
+    Args:
+        found: equations about ``at``.
+        at: ``(k, 3)``.
+    """
+    k = len(at)
+    h = found.information
+    unit = np.sqrt(np.maximum(np.diag(h), 1e-300))
+    spread = found.spread * inflation / np.outer(unit, unit)
+    inverse = np.linalg.pinv(spread, rcond=1e-6, hermitian=True) / np.outer(unit, unit)
+    precision = h @ inverse @ h
+    pull = h @ inverse @ (found.pull + h @ at.T.ravel())
+    between = 0.25 * np.eye(3)
+    for _ in range(_ROUNDS):
+        prior = np.kron(between, np.eye(k))
+        covariance = np.linalg.solve(np.eye(3 * k) + prior @ precision, prior)
+        mean = covariance @ pull
+        second = (np.outer(mean, mean) + covariance).reshape(3, k, 3, k)
+        between = np.einsum("ikjk->ij", second) / k + _LEAST_MM**2 * np.eye(3)
+    _, determinant = np.linalg.slogdet(np.eye(3 * k) + prior @ precision)
+    evidence = 0.5 * float(pull @ mean) - 0.5 * float(determinant)
+    return _Belief(mean.reshape(3, k).T, 0.5 * (covariance + covariance.T), evidence)
+
+
+@checked
+def estimate_motion(
+    scan: Scan,
+    grid: VolumeGrid,
+    *,
+    heart_rate: float | None = None,
+    rotation_s: float | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> InsetMotion:
+    """The rigid displacement of what lies in an inset, in every view, from its own readings.
+
+    Args:
+        scan: counting, one channel, of a cone beam on a circle, acquired with ``region``: the
+            surround is known, all else lies in the region at all times.
+        grid: ``(z, y, x)`` grid of the inset; the working grid covers the scan's region.
+        heart_rate: beats a minute; the path then repeats itself with every beat. None: any smooth
+            path, a cubic spline.
+        rotation_s: time of one turn in s, for ``heart_rate``.
+        progress: called with the finished fraction, 0…1.
+
+    Returns:
+        The path with standard errors, and whether the readings hold it; if not, the path is zero
+        and ``warnings`` say so. The errors are those of noise, of a model of voxels and of what no
+        view sees, under the prior.
+
+    Raises:
+        ValueError: an unknown surround, energy bins, another geometry, fewer than 48 views, a path
+            longer than 2.5 mm from its mean, a heart's rate without the time of a turn.
+        TypeError: no :class:`torchpcct.Scan`.
+    """
+    _require_inset(scan)
+    problem = _Problem(scan, grid, _beats(scan, heart_rate, rotation_s))
+    tell = progress or (lambda _: None)
+    at = problem.start()
+    rest, _ = problem.at(np.zeros_like(at))
+    effects: Tensor | None = None
+    for step in range(1, _STEPS + 1):
+        found, effects = problem.at(at, effects)
+        if not np.diag(found.information).max() > 0.0:
+            return _none(problem, rest.misfit, step)
+        belief = _believed(found, at, problem.inflation)
+        change = problem.path(belief.mean - at)
+        largest = float(np.abs(change).max())
+        errors = problem.errors(belief.covariance)
+        at = at + (belief.mean - at) / max(1.0, largest / _LARGEST_STEP_MM)
+        farthest = float(np.abs(problem.path(at)).max())
+        if farthest > _REACH_MM:
+            raise ValueError(
+                f"the path that fits leads {farthest:.2g} mm away from its mean, more than the "
+                f"{_REACH_MM:g} mm that are looked for: the inset moves too far in this scan, or "
+                "what it holds is too faint for its motion to be found"
+            )
+        effects = effects if largest < _NEAR_MM else None
+        tell(step / (_STEPS + 1))
+        if _rms(change) < _SETTLED * _rms(errors):
+            break
+    path = problem.path(at)
+    size, error = _rms(path), _rms(errors)
+    held = belief.evidence >= _LEAST_EVIDENCE and size > max(_FLOOR_MM, error)
+    after = problem.at(at, effects)[0].misfit if held else rest.misfit
+    texts = []
+    if not held:
+        texts.append(
+            "the readings hold no motion of the inset: the path that fits best has "
+            f"{size:.2g} ± {error:.2g} mm, root mean square; none is applied"
+        )
+    if after**2 > _ANOTHER * (_LEFT_NOISE + _LEFT_MODEL * problem.signal):
+        texts.append(
+            "what the inset leaves of the readings along the path is more than noise "
+            f"({after:.2g} times): it does not move as one rigid body along a smooth path, parts "
+            "of it may move differently, turn or jump"
+        )
+    for text in texts:
+        _LOG.warning("%s", text)
+    tell(1.0)
+    return InsetMotion(
+        path if held else np.zeros_like(path),
+        errors,
+        held,
+        belief.evidence,
+        size,
+        (rest.misfit, after),
+        step,
+        texts,
+    )
+
+
+def _none(problem: _Problem, misfit: float, step: int) -> InsetMotion:
+    """Nothing is seen in the inset, so nothing of it is seen to move."""
+    nowhere = np.zeros((len(problem.basis), 3))
+    text = "the inset shows nothing above its noise whose motion could be found; none is applied"
+    _LOG.warning("%s", text)
+    unknown = np.full_like(nowhere, math.inf)
+    return InsetMotion(nowhere, unknown, False, 0.0, 0.0, (misfit, misfit), step, [text])
+
+
+def _rms(path: Floats) -> float:
+    """Root mean square length of displacements ``(views, 3)``."""
+    return math.sqrt(float((path**2).sum(1).mean()))
+
+
+def _require_inset(scan: Scan) -> None:
+    if not isinstance(scan, Scan):
+        raise TypeError(f"scan must be a Scan, got {type(scan).__name__}")
+    if not isinstance(scan.geometry, ConeBeam):
+        raise ValueError(
+            "motion is estimated of a cone beam on a circle, this scan has a "
+            f"{type(scan.geometry).__name__}: give the displacement in every view, motion=path"
+        )
+    if scan.window is None or scan.surround is None:
+        raise ValueError(
+            "the motion of an inset and an unknown surround cannot both be found: acquire the "
+            "scan with region="
+        )
+    if scan.counts.ndim != 3:
+        raise ValueError(
+            "motion is estimated from one channel; sum the energy bins with weights before: "
+            "scan.weighted(bin_weights(scanner, …))"
+        )
+    if scan.geometry.views < _LEAST_VIEWS:
+        raise ValueError(
+            f"motion needs at least {_LEAST_VIEWS} views, this scan has {scan.geometry.views}: of "
+            "fewer, streaks pass for motion"
+        )
+
+
+def _beats(scan: Scan, heart_rate: float | None, rotation_s: float | None) -> float | None:
+    """Beats in one scan."""
+    if heart_rate is None:
+        if rotation_s is not None:
+            raise ValueError("rotation_s is for heart_rate: give both, or neither")
+        return None
+    if rotation_s is None:
+        raise ValueError("heart_rate needs rotation_s, the time of one turn in s")
+    beats = number("heart_rate", heart_rate, positive=True) / 60.0
+    turn = number("rotation_s", rotation_s, positive=True, unit="s")
+    angles = np.unwrap(scan.geometry.angles)
+    return beats * turn * abs(float(angles[-1] - angles[0])) / (2.0 * math.pi)
+
+
+def path_of(motion: object, scan: Scan, grid: VolumeGrid) -> tuple[Floats, InsetMotion | None]:
+    """What :func:`recon.reconstruct` was given as ``motion``: the path in every view, and how it
+    was estimated if it was.
+
+    Raises:
+        ValueError: another word than "estimate"; see :func:`estimate_motion`.
+    """
+    if isinstance(motion, str):
+        if motion != "estimate":
+            raise ValueError(
+                f'motion must be "estimate" or the displacement in every view, got {motion!r}'
+            )
+        motion = estimate_motion(scan, grid)
+    if isinstance(motion, InsetMotion):
+        return motion.path, motion
+    return check_motion(motion, scan.geometry.views, 3), None

@@ -1,0 +1,125 @@
+"""Motion of an inset from its own scan: what moves is followed, within its errors; nothing is
+invented."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from refusals import refused
+
+import recon
+from recon.analytic.inset import InsetFbp, view_motion
+from recon.motion import estimate_motion
+from torchpcct import FanBeam, Scan, VolumeGrid, acquire, full_turn
+from torchpcct.scanner import presets
+from torchpcct.scene import Body, Scene, SinusoidalMotion
+from torchpcct.scene.bodies import Ellipsoid, EllipticCylinder
+
+X, Y = -18.0, -12.0
+GRID = VolumeGrid((9, 16, 16), 0.45, (0.0, Y, X))
+SCANNER = presets.pcct(views=48, rows=16, columns=500)
+TURN_S = 0.35
+EXPOSURE_S = 40.0  # 48 views of the many of a turn
+
+
+def _scan(*motion: SinusoidalMotion, second: bool = False) -> Scan:
+    def ball(name: str, radius: float, dx: float, material: str) -> Body:
+        return Body(name, Ellipsoid((radius,) * 3, position=(X + dx, Y, 0.0)), material, "patient")
+
+    bodies = [Body("patient", EllipticCylinder(40.0), "pericoronary_fat")]
+    bodies += [ball("vessel", 1.2, -1.6 if second else 0.0, "blood_iodine")]
+    bodies += [ball("second", 1.0, 2.0, "blood_iodine")] if second else []
+    scene = Scene(bodies, motion)
+    return acquire(scene, SCANNER, region=GRID, rotation_s=TURN_S, sub_rays=16)
+
+
+@pytest.fixture(scope="module")
+def moving():
+    return _scan(SinusoidalMotion("vessel", 1.0, direction=0.4))
+
+
+def _truth(scan: Scan) -> Any:
+    motion = SinusoidalMotion("vessel", 1.0, direction=0.4)
+    path = view_motion(motion, scan.geometry, TURN_S)
+    return path, path - path.mean(0)
+
+
+def test_a_moving_inset_is_followed_and_shown_at_rest(moving):
+    scan = moving.with_noise(EXPOSURE_S, 0)
+    volume = recon.reconstruct(scan, GRID, motion="estimate")
+    said = volume.report["motion"]
+    path, truth = np.array(said["path_mm"]), _truth(scan)[1]
+    errors = np.array(said["errors_mm"])
+    assert said["held"]
+    assert np.sqrt(((path - truth) ** 2).sum(1).mean()) < 0.06
+    assert (np.abs(path - truth) < 3.5 * errors).all()
+    assert said["misfit"][1] < 0.7 * said["misfit"][0]
+    known, ignored = (
+        InsetFbp(scan, [GRID], ["standard"], motion=m)(scan)[0][0] for m in (truth, None)
+    )
+    off = [float((v - known).square().mean().sqrt()) for v in (volume.data, ignored)]
+    assert off[0] < 0.25 * off[1]
+    again = recon.reconstruct(scan, GRID, motion=path)
+    torch.testing.assert_close(again.data, volume.data, rtol=0, atol=0.5)
+
+
+def test_no_motion_is_invented():
+    scan = _scan().with_noise(EXPOSURE_S, 1)
+    found = estimate_motion(scan, GRID)
+    assert not found.held
+    assert not found.path.any()
+    assert found.rms_mm < 0.04
+    assert found.errors.max() < 0.1
+    assert "hold no motion" in found.warnings[0]
+
+
+@pytest.mark.extended
+def test_vessels_that_move_differently_are_said():
+    apart = [
+        SinusoidalMotion(name, 0.8, direction=way) for name, way in (("vessel", 0), ("second", 1.6))
+    ]
+    found = estimate_motion(_scan(*apart, second=True).with_noise(EXPOSURE_S, 2), GRID)
+    assert any("may move differently" in text for text in found.warnings)
+    alike = [replace(m, direction=0.3) for m in apart]
+    found = estimate_motion(_scan(*alike, second=True).with_noise(EXPOSURE_S, 2), GRID)
+    assert found.held
+    assert not found.warnings
+
+
+@pytest.mark.extended
+def test_errors_cover_what_noise_does(moving):
+    truth = _truth(moving)[1]
+    found = [estimate_motion(moving.with_noise(EXPOSURE_S / 6, seed), GRID) for seed in range(10)]
+    off = np.array([(f.path - truth) / f.errors for f in found])
+    assert np.mean(np.abs(off) < 2.0) > 0.9
+    assert np.sqrt(np.mean(off**2)) > 0.2  # nor are they empty words
+
+
+@pytest.mark.extended
+def test_a_beating_heart(moving):
+    beat = SinusoidalMotion("vessel", 0.8, rate_bpm=343.0, direction=1.0)  # 2 beats a turn
+    scan = _scan(beat).with_noise(EXPOSURE_S, 0)
+    found = estimate_motion(scan, GRID, heart_rate=343.0, rotation_s=TURN_S)
+    path = view_motion(beat, scan.geometry, TURN_S)
+    assert np.sqrt(((found.path - path + path.mean(0)) ** 2).sum(1).mean()) < 0.08
+
+
+def test_refusals(moving):
+    counts = torch.ones(moving.geometry.shape)
+    whole = replace(moving, window=None, surround=None, region=None, counts=counts)
+    fan = FanBeam(full_turn(60), 40.0, 60.0, 48, 0.4)
+    flat = Scan.from_line_integrals(torch.zeros(fan.shape), fan, photons=1e4, mu_water=0.02)
+    few = moving.select(slice(0, None, 2))
+    refused(
+        ("surround cannot both be found", lambda: estimate_motion(whole, GRID)),
+        ("at least 48 views", lambda: estimate_motion(few, GRID)),
+        ("cone beam on a circle", lambda: estimate_motion(flat, GRID)),
+        ("needs rotation_s", lambda: estimate_motion(moving, GRID, heart_rate=60.0)),
+        ("give both", lambda: estimate_motion(moving, GRID, rotation_s=0.35)),
+        ("must be a Scan", lambda: estimate_motion(torch.zeros(3), GRID)),  # type: ignore[arg-type]
+        ('"estimate" or', lambda: recon.reconstruct(moving, GRID, motion="guess")),
+        ("surround of the inset", lambda: recon.reconstruct(whole, GRID, motion="estimate")),
+        (r"\(48, 3\)", lambda: recon.reconstruct(moving, GRID, motion=np.zeros((47, 3)))),
+    )
