@@ -32,7 +32,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from recon.analytic.fbp import FbpPlan
-from recon.variable_projection import Normal, normal_equations, smoothed_cells
+from recon.variable_projection import Normal, misfit, normal_equations, smoothed_cells
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, VolumeGrid
 from torchpcct.projector import Projector, with_parameters
@@ -86,12 +86,13 @@ _LEAST_EVIDENCE = 6.0
 """Logarithm of the marginal likelihood's ratio to rest, from which on a motion is believed."""
 _FLOOR_MM = 0.02
 """Root mean square path below which voxels and averaged views are as likely its cause."""
-_LEFT_NOISE = 1.17
 _LEFT_MODEL = 0.014
-"""What noise, and errors of the model over the mean square of the readings, leave of the smoothed
-readings, in units of their noise's variance; of the paper's plaque."""
-_ANOTHER = 1.4
-"""Times that, from which on something else moves."""
+"""What errors of the model leave of the smoothed readings, mean square in units of their noise's
+variance, over :attr:`_Problem.signal`; of the paper's plaque, at rest."""
+_ANOTHER = 3.0
+"""Times that, beside what noise leaves, from which on something else moves."""
+_CHANCE = 1.05
+"""Times what a draw of the noise leaves, from which on another draw is not the cause."""
 
 
 @dataclass(frozen=True)
@@ -238,24 +239,37 @@ class _Problem:
         """``(views, 3)`` mm in the views of the scan."""
         return self.basis @ coefficients
 
+    def _plan(self, kernel: str, motion: Floats) -> FbpPlan:
+        return FbpPlan(self.geometry, [self.grid], kernel, motion=motion, window=self.window)
+
+    def _volume(self, plan: FbpPlan, lines: Tensor) -> Tensor:
+        return plan.backprojected(plan.filtered(lines, held=self.window))[0]
+
+    def _left(self, motion: Floats) -> Callable[[Tensor], Tensor]:
+        """What volumes that move leave of readings."""
+        engine = Projector(self.geometry, self.grid, self.window, motion)
+        plan = self._plan("ram-lak", motion)
+
+        def left(lines: Tensor) -> Tensor:
+            for _ in range(_TIMES + 1):
+                lines = lines - engine(self._volume(plan, lines))
+            return lines
+
+        return left
+
+    def misfits(self) -> tuple[float, float]:
+        """What a volume at rest leaves of the readings, and of noise alone, over the noise."""
+        noise = torch.randn(self.lines.shape, generator=torch.Generator().manual_seed(0))
+        drawn = torch.stack([self.lines, noise / self.weights.sqrt()])
+        found = smoothed_cells(self._left(np.zeros((self.geometry.views, 3)))(drawn), 2)
+        rest, quiet = (misfit(f, self.weights, 2) for f in found)
+        return rest, quiet
+
     def at(self, coefficients: Floats, effects: Tensor | None = None) -> tuple[Normal, Tensor]:
         """Equations for what is to be added to the coefficients, axis by axis, and the effects;
         ``effects``: of another state nearby, which are not computed again."""
         motion = np.ascontiguousarray(self._few @ coefficients)
-        engine = Projector(self.geometry, self.grid, self.window, motion)
-        sharp, soft = (
-            FbpPlan(self.geometry, [self.grid], k, motion=motion, window=self.window)
-            for k in ("ram-lak", "soft")
-        )
-
-        def volume(plan: FbpPlan, lines: Tensor) -> Tensor:
-            return plan.backprojected(plan.filtered(lines, held=self.window))[0]
-
-        def left(lines: Tensor) -> Tensor:
-            for _ in range(_TIMES + 1):
-                lines = lines - engine(volume(sharp, lines))
-            return lines
-
+        left = self._left(motion)
         rest = smoothed_cells(left(self.lines[None]), 2)
         if effects is None:
             posed = PosedEngine(
@@ -266,7 +280,8 @@ class _Problem:
             for axis in range(3):
                 tangents[axis, :, :2, 2 - axis] = -1.0
             # Of a smoother volume: its noise must not be taken for edges that move.
-            moved = posed.derivatives(_quiet(volume(soft, self.lines)), tangents)
+            soft = self._volume(self._plan("soft", motion), self.lines)
+            moved = posed.derivatives(_quiet(soft), tangents)
             over_time = torch.from_numpy(self._few.T.astype(np.float32))[None, :, :, None, None]
             effects = smoothed_cells(left((moved[:, None] * over_time).flatten(0, 1)), 2)
         return normal_equations(effects, rest, self.weights, 2), effects
@@ -434,12 +449,12 @@ def estimate_motion(
     problem = _Problem(scan, grid, _beats(scan, heart_rate, rotation_s))
     tell = progress or (lambda _: None)
     at = problem.start()
-    rest, _ = problem.at(np.zeros_like(at))
+    rest, quiet = problem.misfits()
     effects: Tensor | None = None
     for step in range(1, _STEPS + 1):
         found, effects = problem.at(at, effects)
         if not np.diag(found.information).max() > 0.0:
-            return _none(problem, rest.misfit, step)
+            return _none(problem, rest, step)
         belief = _believed(found, at, problem.inflation)
         change = problem.path(belief.mean - at)
         largest = float(np.abs(change).max())
@@ -459,14 +474,14 @@ def estimate_motion(
     path = problem.path(at)
     size, error = _rms(path), _rms(errors)
     held = belief.evidence >= _LEAST_EVIDENCE and size > max(_FLOOR_MM, error)
-    after = problem.at(at, effects)[0].misfit if held else rest.misfit
+    after = problem.at(at, effects)[0].misfit if held else rest
     texts = []
     if not held:
         texts.append(
             "the readings hold no motion of the inset: the path that fits best has "
             f"{size:.2g} ± {error:.2g} mm, root mean square; none is applied"
         )
-    if after**2 > _ANOTHER * (_LEFT_NOISE + _LEFT_MODEL * problem.signal):
+    if after**2 > _CHANCE * quiet**2 + _ANOTHER * _LEFT_MODEL * problem.signal:
         texts.append(
             "what the inset leaves of the readings along the path is more than noise "
             f"({after:.2g} times): it does not move as one rigid body along a smooth path, parts "
@@ -481,19 +496,19 @@ def estimate_motion(
         held,
         belief.evidence,
         size,
-        (rest.misfit, after),
+        (rest, after),
         step,
         texts,
     )
 
 
-def _none(problem: _Problem, misfit: float, step: int) -> InsetMotion:
+def _none(problem: _Problem, left: float, step: int) -> InsetMotion:
     """Nothing is seen in the inset, so nothing of it is seen to move."""
     nowhere = np.zeros((len(problem.basis), 3))
     text = "the inset shows nothing above its noise whose motion could be found; none is applied"
     _LOG.warning("%s", text)
     unknown = np.full_like(nowhere, math.inf)
-    return InsetMotion(nowhere, unknown, False, 0.0, 0.0, (misfit, misfit), step, [text])
+    return InsetMotion(nowhere, unknown, False, 0.0, 0.0, (left, left), step, [text])
 
 
 def _rms(path: Floats) -> float:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-__all__ = ["Normal", "normal_equations", "products", "smoothed_cells"]
+__all__ = ["Normal", "misfit", "normal_equations", "products", "smoothed_cells"]
 
 Floats = NDArray[np.float64]
 
@@ -68,13 +68,21 @@ def normal_equations(
     noisy = smoothed_cells(own * weights, cells)
     if explained is not None:
         noisy = explained(noisy * variance * known) * weights
-    quiet = _filtered(variance, _kernel(weights).square(), cells)
     return Normal(
         products(own * weights, own),
         products(own * weights, rest)[:, 0],
         products(noisy * variance, noisy),
-        math.sqrt(float((rest[0].square() / quiet)[known].double().mean())),
+        misfit(rest[0], weights, cells),
     )
+
+
+def misfit(rest: Tensor, weights: Tensor, cells: int) -> float:
+    """Root mean square of smoothed readings ``(views, …)`` over their noise; the rest as for
+    :func:`normal_equations`."""
+    known = weights > 0
+    variance = 1.0 / torch.where(known, weights, weights[known].mean())
+    quiet = _filtered(variance, _kernel(weights).square(), cells)
+    return math.sqrt(float((rest.square() / quiet)[known].double().mean()))
 
 
 def smoothed_cells(readings: Tensor, cells: int) -> Tensor:

@@ -53,6 +53,7 @@ def test_a_moving_inset_is_followed_and_shown_at_rest(moving):
     path, truth = np.array(said["path_mm"]), _truth(scan)[1]
     errors = np.array(said["errors_mm"])
     assert said["held"]
+    assert not any("move differently" in text for text in volume.report["warnings"])
     assert np.sqrt(((path - truth) ** 2).sum(1).mean()) < 0.06
     assert (np.abs(path - truth) < 3.5 * errors).all()
     assert said["misfit"][1] < 0.7 * said["misfit"][0]
@@ -78,7 +79,7 @@ def test_no_motion_is_invented():
 @pytest.mark.extended
 def test_vessels_that_move_differently_are_said():
     apart = [
-        SinusoidalMotion(name, 0.8, direction=way) for name, way in (("vessel", 0), ("second", 1.6))
+        SinusoidalMotion(name, 0.5, direction=way) for name, way in (("vessel", 0), ("second", 1.6))
     ]
     found = estimate_motion(_scan(*apart, second=True).with_noise(EXPOSURE_S, 2), GRID)
     assert any("may move differently" in text for text in found.warnings)
@@ -99,9 +100,9 @@ def test_errors_cover_what_noise_does(moving):
 
 @pytest.mark.extended
 def test_a_beating_heart(moving):
-    beat = SinusoidalMotion("vessel", 0.8, rate_bpm=343.0, direction=1.0)  # 2 beats a turn
+    beat = SinusoidalMotion("vessel", 0.8, rate_bpm=100.0, direction=1.0)
     scan = _scan(beat).with_noise(EXPOSURE_S, 0)
-    found = estimate_motion(scan, GRID, heart_rate=343.0, rotation_s=TURN_S)
+    found = estimate_motion(scan, GRID, heart_rate=100.0, rotation_s=TURN_S)
     path = view_motion(beat, scan.geometry, TURN_S)
     assert np.sqrt(((found.path - path + path.mean(0)) ** 2).sum(1).mean()) < 0.08
 
