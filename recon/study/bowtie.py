@@ -520,7 +520,7 @@ def _combined(
     plain = read_task("plaque")
     scanners = {b: presets.pcct(views=s.plaque_views, bowtie=b) for b in BOWTIES}
     tasks = {
-        b: replace(plain, name=f"plaque behind {b}", scanner=scanner)
+        b: replace(plain, name=f"plaque-behind-{b.replace('+', '-')}", scanner=scanner)
         for b, scanner in scanners.items()
     }
     found = evaluate(
