@@ -23,7 +23,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -40,6 +40,9 @@ from torchpcct.projector.posed import PosedEngine
 from torchpcct.scan import Scan
 from torchpcct.validate import checked, number
 from torchpcct.vector_geometry import check_motion
+
+if TYPE_CHECKING:
+    from torchpcct.typing import JsonObject
 
 __all__ = ["InsetMotion", "estimate_motion", "path_of"]
 
@@ -62,6 +65,7 @@ _REACH_MM = 2.5
 _TIMES = 2
 """How often what a volume explains is taken off, beside the first time."""
 _STEPS = 6
+"""Most iterations."""
 _SETTLED = 0.5
 """Change of the path in the last step over its standard error, root mean squares."""
 _NEAR_MM = 0.05
@@ -69,8 +73,9 @@ _NEAR_MM = 0.05
 _LARGEST_STEP_MM = 0.7
 """Of one iteration."""
 _SPEED = 3.0
+"""Of the prior of a path over a scan, relative: speeds, 1 / scan."""
 _BEND = 6.0
-"""Of the prior of a path over a scan, relative: speeds (1 / scan) and their changes (1 / scan²)."""
+"""Of the same: changes of the speed, 1 / scan²."""
 _LEAST_MM = 0.003
 """Of the prior's scale along any axis."""
 _ROUNDS = 60
@@ -121,7 +126,7 @@ class InsetMotion:
     steps: int
     warnings: list[str] = field(default_factory=list)
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> JsonObject:
         """All numbers, for JSON."""
         return {
             "held": self.held,
@@ -145,7 +150,7 @@ class _Problem:
     """
 
     def __init__(self, scan: Scan, grid: VolumeGrid, rate: float | None) -> None:
-        geometry: Any = scan.geometry
+        geometry = scan.geometry
         self._noise_free = scan.noise_free
         region = grid if scan.region is None else scan.region
         spacing = max(_VOXEL_CELLS * geometry.cell, *grid.spacing)
@@ -330,7 +335,7 @@ def _averages(groups: list[NDArray[np.int64]], views: int) -> Floats:
     return found
 
 
-def _centre_columns(geometry: Any, grid: VolumeGrid) -> Floats:
+def _centre_columns(geometry: ConeBeam, grid: VolumeGrid) -> Floats:
     """Where the middle of a grid falls in every view, in columns."""
     cy, cx = grid.center[-2:]
     c, s = np.cos(geometry.angles), np.sin(geometry.angles)

@@ -1,7 +1,7 @@
 """The linear response of MBIR to the noise of its data: the best linear control of its figures.
 
 A backward pass gives g = ∂(ROI mean)/∂b of b = AᵀW y, and g·b of every realisation costs nothing.
-Any functional g·b has the exactly known mean g·E[b] and covariance gᵀ Cov(b) g of the readings'
+Every functional g·b has the exactly known mean g·E[b] and covariance gᵀ Cov(b) g of the readings'
 noise, whatever the method; the closer g follows the method, the higher the correlation, and the
 fewer realisations an interval needs (:mod:`torchpcct.metrics.control`). For Gaussian noise the best
 g of all is the gradient's expectation over the noise (Stein 1981, Ann. Statist. 9:1135, lemma 1),

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +22,9 @@ from torchpcct.scan import Scan
 from torchpcct.scene import Body, SinusoidalMotion
 from torchpcct.scene.bodies import Ellipsoid
 from torchpcct.scene.plaque import Plaque, plaque_scene
+
+if TYPE_CHECKING:
+    from torchpcct.typing import JsonObject
 
 __all__ = ["CASES", "found_paths"]
 
@@ -101,7 +104,7 @@ CASES: Mapping[str, Callable[[float, float], tuple[SinusoidalMotion, ...]]] = {
 
 def found_paths(
     s: FoundSettings, grid: VolumeGrid, pieces: Pieces, progress: Callable[[float], None]
-) -> list[dict[str, Any]]:
+) -> list[JsonObject]:
     """One row for each case, amplitude and exposure.
 
     Args:
@@ -177,11 +180,11 @@ def _estimates(scan: Scan, grid: VolumeGrid, exposure_s: float, seeds: range) ->
     return [estimate_motion(scan.with_noise(exposure_s, seed), grid) for seed in seeds]
 
 
-def _row(found: list[InsetMotion], truth: NDArray[np.float64] | None) -> dict[str, Any]:
-    def rms(values: Any) -> float:
+def _row(found: list[InsetMotion], truth: NDArray[np.float64] | None) -> JsonObject:
+    def rms(values: list[NDArray[np.float64]] | NDArray[np.float64]) -> float:
         return float(np.sqrt((np.asarray(values) ** 2).sum(-1).mean()))
 
-    row: dict[str, Any] = {
+    row: JsonObject = {
         "stated_mm": rms([f.errors for f in found]),
         "held": sum(f.held for f in found),
         "said": sum(any("move differently" in text for text in f.warnings) for f in found),
