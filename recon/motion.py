@@ -90,7 +90,8 @@ over the readings' root mean square; of the paper's plaque, 96 averaged views.""
 _LEAST_EVIDENCE = 6.0
 """Logarithm of the marginal likelihood's ratio to rest, from which on a motion is believed."""
 _FLOOR_MM = 0.02
-"""Root mean square path below which voxels and averaged views are as likely its cause."""
+"""Of every standard error, and of a path that is applied: below, voxels and averaged views are as
+likely the cause, and a prior that the readings chose themselves says too little of its error."""
 _LEFT_MODEL = 0.014
 """What errors of the model leave of the smoothed readings, mean square in units of their noise's
 variance, over :attr:`_Problem.signal`; of the paper's plaque, at rest."""
@@ -204,7 +205,7 @@ class _Problem:
         k = self.basis.shape[1]
         blocks = [covariance[a * k : (a + 1) * k, a * k : (a + 1) * k] for a in range(3)]
         variances = [np.einsum("vi,ij,vj->v", self.basis, b, self.basis) for b in blocks]
-        return np.sqrt(np.maximum(np.stack(variances, 1), 0.0))
+        return np.sqrt(np.maximum(np.stack(variances, 1), 0.0) + _FLOOR_MM**2)
 
     def start(self) -> Floats:
         """Coefficients ``(k, 3)`` from the centres of mass of the readings."""
