@@ -20,14 +20,12 @@ if TYPE_CHECKING:
     from recon.api import reconstruct
     from recon.calibration import calibrate
     from recon.least_squares.pwls import pwls
-    from recon.motion import estimate_motion
     from recon.names import METHODS
 
-__all__ = ["METHODS", "calibrate", "estimate_motion", "fbp", "pwls", "reconstruct"]
+__all__ = ["METHODS", "calibrate", "fbp", "pwls", "reconstruct"]
 
 _SOURCES = {
     "calibrate": "recon.calibration",
-    "estimate_motion": "recon.motion",
     "fbp": "recon.analytic.fbp",
     "pwls": "recon.least_squares.pwls",
     "METHODS": "recon.names",
