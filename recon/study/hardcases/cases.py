@@ -675,7 +675,6 @@ _BODY: dict[str, Case] = {
     "log10": Case(
         "logarithms to base 10",
         lambda clean, scan, rng: _line_integrals(scan, math.log(10.0)),
-        unseen=_SCALED,
     ),
     # Which part of it there is.
     "twice": Case(
