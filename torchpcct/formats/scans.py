@@ -317,7 +317,8 @@ def _placed(scan: Scan, geometry: VectorGeometry) -> Scan:
         raise ValueError("this scan holds a part of the detector: a VectorGeometry needs all of it")
     turned = geometry.has_rows and not scan.geometry.has_rows and scan.counts.ndim == 3
     if turned:
-        scan = replace(scan, **scan.each(lambda readings: readings.movedim(0, 1).contiguous()))
+        changed = scan.each(lambda readings: readings.movedim(0, 1).contiguous())
+        return replace(scan, geometry=geometry, **changed)
     return replace(scan, geometry=geometry)
 
 

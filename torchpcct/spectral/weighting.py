@@ -205,6 +205,8 @@ def _photons(
 ) -> tuple[Floats, Floats, tuple[str, ...], dict[str, float]]:
     """Photons ``(bins, columns, E)`` that are counted behind the materials, the contrast ``(E,)``
     in mm⁻¹, and the names."""
+    if not isinstance(behind, Mapping | None):
+        raise TypeError(f"behind must be a mapping of materials to mm, got {behind!r}")
     _require_bins(scanner)
     if isinstance(contrast, str) or len(contrast) != 2:
         raise ValueError(
