@@ -31,7 +31,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.analytic.fbp import fbp
-from recon.variable_projection import normal_equations, products, smoothed_cells
+from recon.variable_projection import (
+    normal_equations,
+    products,
+    smoothed_cells,
+    unexplained,
+)
 from torchpcct.checks.defects import repair_defects
 from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.projector.posed import PosedEngine
@@ -356,9 +361,12 @@ class _Problem:
                 return fbp(lines, geometry, self.grid, kernel, outside=0.0)
 
         def left(lines: Tensor) -> Tensor:
-            for _ in range(_TIMES + 1):
-                lines = lines - engine.apply(volume(lines, "ram-lak"), False)
-            return lines
+            return unexplained(
+                lines,
+                lambda v: volume(v, "ram-lak"),
+                lambda v: engine.apply(v, False),
+                _TIMES + 1,
+            )
 
         w, rest = self.weights, self.lines[None]
         if effects is None:

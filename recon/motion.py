@@ -22,7 +22,7 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,7 +32,13 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from recon.analytic.fbp import FbpPlan
-from recon.variable_projection import Normal, misfit, normal_equations, smoothed_cells
+from recon.variable_projection import (
+    Normal,
+    misfit,
+    normal_equations,
+    smoothed_cells,
+    unexplained,
+)
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, VolumeGrid
 from torchpcct.projector import Projector, with_parameters
@@ -255,13 +261,7 @@ class _Problem:
         """What volumes that move leave of readings."""
         engine = Projector(self.geometry, self.grid, self.window, motion)
         plan = self._plan("ram-lak", motion)
-
-        def left(lines: Tensor) -> Tensor:
-            for _ in range(_TIMES + 1):
-                lines = lines - engine(self._volume(plan, lines))
-            return lines
-
-        return left
+        return lambda lines: unexplained(lines, partial(self._volume, plan), engine, _TIMES + 1)
 
     def misfits(self) -> tuple[float, float]:
         """What a volume at rest leaves of the readings, and of noise alone, over the noise."""

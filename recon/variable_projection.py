@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-__all__ = ["Normal", "misfit", "normal_equations", "products", "smoothed_cells"]
+__all__ = ["Normal", "misfit", "normal_equations", "products", "smoothed_cells", "unexplained"]
 
 Floats = NDArray[np.float64]
 
@@ -83,6 +83,25 @@ def misfit(rest: Tensor, weights: Tensor, cells: int) -> float:
     variance = 1.0 / torch.where(known, weights, weights[known].mean())
     quiet = _filtered(variance, _kernel(weights).square(), cells)
     return math.sqrt(float((rest.square() / quiet)[known].double().mean()))
+
+
+def unexplained(
+    readings: Tensor,
+    volume: Callable[[Tensor], Tensor],
+    project: Callable[[Tensor], Tensor],
+    times: int,
+) -> Tensor:
+    """What no volume explains of readings: what an approximate inverse does is taken off so many
+    times.
+
+    Args:
+        readings: ``(…, views, …)``.
+        volume: of readings; project: of a volume.
+        times: ≥ 1.
+    """
+    for _ in range(times):
+        readings = readings - project(volume(readings))
+    return readings
 
 
 def smoothed_cells(readings: Tensor, cells: int) -> Tensor:

@@ -270,7 +270,7 @@ def contrast_recovery(
         asked_at = {ball: _checked_places(places, axes, scan, grid, ball) for ball in balls}
     soft = method_of(REFERENCE)
     steps = {m.name: m for m in [soft, *asked]}
-    noise = _noise(scan, grid)
+    noise, weights = _noise(scan, grid), noise_weights(scan)
     tell, done, total = progress or (lambda _: None), 0, len(steps) * (1 + len(balls))
 
     def volumes(of: Scan) -> dict[str, Tensor]:
@@ -290,8 +290,8 @@ def contrast_recovery(
             if places is None
             else asked_at[ball]
         )
-        after = volumes(with_balls(scan, grid, ball, at))
-        detectability = detectability_of(scan, grid, ball, at)
+        with_them, detectability = with_balls(scan, grid, ball, at, weights)
+        after = volumes(with_them)
         truth = _truth(scan, grid, ball, at)
         cells = _territories(grid, at)
 
@@ -335,30 +335,33 @@ def _noise(scan: Scan, grid: VolumeGrid) -> Callable[[Method, float], float]:
     return noise
 
 
-def with_balls(scan: Scan, grid: VolumeGrid, ball: InsertedBall, places: Floats) -> Scan:
-    """The scan with balls at ``places`` ``(n, axes)`` in mm inserted."""
-    added = torch.zeros(scan.counts.shape)
-    for at, projection in _projections(scan, grid, ball, places):
-        added[at] += projection
-    return scan.with_added(added)
-
-
-def detectability_of(
-    scan: Scan, grid: VolumeGrid, ball: InsertedBall, places: Floats
-) -> float | None:
-    """d′ of a ball in the readings, mean over ``places`` ``(n, axes)`` in mm; None of a scan
-    without noise, or one whose noise is not known."""
+def noise_weights(scan: Scan) -> Tensor | None:
+    """Inverse variances of the line integrals; None of a scan without noise, or one whose noise is
+    not known."""
     if scan.noise_free:
         return None
     try:
-        weights = scan.weights()
+        return scan.weights()
     except ValueError:
         return None
-    found = [
-        math.sqrt(float((weights[at] * projection.square()).sum(dtype=torch.float64)))
-        for at, projection in _projections(scan, grid, ball, places)
-    ]
-    return float(np.mean(found))
+
+
+def with_balls(
+    scan: Scan, grid: VolumeGrid, ball: InsertedBall, places: Floats, weights: Tensor | None = None
+) -> tuple[Scan, float | None]:
+    """The scan with balls at ``places`` ``(n, axes)`` in mm inserted; and d′ of a ball in the
+    readings, mean over the places.
+
+    Args:
+        weights: of :func:`noise_weights`; None: d′ is None.
+    """
+    added = torch.zeros(scan.counts.shape)
+    powers = []
+    for at, projection in _projections(scan, grid, ball, places):
+        added[at] += projection
+        if weights is not None:
+            powers.append(float((weights[at] * projection.square()).sum(dtype=torch.float64)))
+    return scan.with_added(added), float(np.mean(np.sqrt(powers))) if powers else None
 
 
 def _projections(

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -47,8 +47,8 @@ _SAMPLES = 400
 """Water thicknesses at which pile-up is known for the water correction."""
 
 
-Behind: TypeAlias = Mapping[str, float] | Mapping[Material, float] | Mapping[Material | str, float]
-"""Materials that the rays cross, or their names → thickness in mm."""
+M = TypeVar("M", bound=Material | str)
+"""Materials or their names: the keys of a mapping of the one kind, of the other, or of both."""
 
 
 class BinWeights(np.ndarray[tuple[int, int], np.dtype[np.float64]]):
@@ -89,7 +89,7 @@ class BinWeights(np.ndarray[tuple[int, int], np.dtype[np.float64]]):
 def bin_weights(
     scanner: Scanner,
     contrast: Sequence[Material | str],
-    behind: Behind | None = None,
+    behind: Mapping[M, float] | None = None,
 ) -> BinWeights:
     """Weights of the energy bins that show a small contrast best, column by column.
 
@@ -118,7 +118,7 @@ def bin_weights(
 def weighting_gain(
     scanner: Scanner,
     contrast: Sequence[Material | str],
-    behind: Behind | None = None,
+    behind: Mapping[M, float] | None = None,
     weights: object = "bins",
 ) -> Floats:
     """What weights bring: squared signal-to-noise ratio of a small contrast over that of the summed
@@ -154,7 +154,7 @@ def weighting_gain(
 def contrast_information(
     scanner: Scanner,
     contrast: Sequence[Material | str],
-    behind: Behind | None = None,
+    behind: Mapping[M, float] | None = None,
     weights: object = "bins",
 ) -> Floats:
     """Squared signal-to-noise ratio of a small contrast that is larger than a cell, per mm² of its
@@ -201,12 +201,10 @@ def contrast_information(
 def _photons(
     scanner: Scanner,
     contrast: Sequence[Material | str],
-    behind: Behind | None,
+    behind: Mapping[M, float] | None,
 ) -> tuple[Floats, Floats, tuple[str, ...], dict[str, float]]:
     """Photons ``(bins, columns, E)`` that are counted behind the materials, the contrast ``(E,)``
     in mm⁻¹, and the names."""
-    if not isinstance(behind, Mapping | None):
-        raise TypeError(f"behind must be a mapping of materials to mm, got {behind!r}")
     _require_bins(scanner)
     if isinstance(contrast, str) or len(contrast) != 2:
         raise ValueError(

@@ -9,7 +9,7 @@ import torch
 from sound_scans import BALL, CYLINDER, Solid, transmissions
 
 from recon.evaluate import InsertedBall, contrast_recovery
-from recon.evaluate.insertion import detectability_of, recovery_table, with_balls
+from recon.evaluate.insertion import noise_weights, recovery_table, with_balls
 from recon.evaluate.without_truth import as_slices
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, full_turn
 
@@ -67,7 +67,7 @@ def test_an_inserted_ball_reads_like_a_ball_that_was_scanned(kind, linearisation
     stack = plain
     if flat:
         stack = as_slices(plain, GRID)[0]
-    found = with_balls(stack, grid, ball, at)
+    found, _ = with_balls(stack, grid, ball, at)
     shown = (found.line_integrals() - stack.line_integrals()).reshape(real.counts.shape)
     truth = real.line_integrals() - plain.line_integrals()
     assert float(truth.max()) > 0.01
@@ -137,9 +137,9 @@ def test_the_ideal_observer_has_the_detectability_that_is_stated(linearisation, 
         scan(readings) for readings in (photons, *rng.poisson(photons, (81, *photons.shape)) * 1.0)
     )
     stack = VolumeGrid((1, 64, 64), 0.75)
-    stated = detectability_of(noisy, stack, ball, place)
+    _, stated = with_balls(noisy, stack, ball, place, noise_weights(noisy))
     y = clean.line_integrals()
-    p = with_balls(clean, stack, ball, place).line_integrals() - y
+    p = with_balls(clean, stack, ball, place)[0].line_integrals() - y
     weights = noisy.weights()
     sums = [float((weights * p * (d.line_integrals() - y)).sum()) for d in draws]
     # 80 draws: the standard deviation is known to 8 %.
@@ -150,7 +150,8 @@ def test_the_ideal_observer_has_the_detectability_that_is_stated(linearisation, 
 def test_a_scan_without_noise_has_no_detectability(fan):
     stack, grid = as_slices(_scan(fan, [DISC]), GRID)
     scan = replace(stack, exposure_s=None)
-    assert detectability_of(scan, grid, InsertedBall(3.0, 60.0), np.zeros((1, 3))) is None
+    ball, weights = InsertedBall(3.0, 60.0), noise_weights(scan)
+    assert with_balls(scan, grid, ball, np.zeros((1, 3)), weights)[1] is None
 
 
 def test_filters_know_the_noise_of_the_scan(fan):
