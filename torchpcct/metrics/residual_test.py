@@ -88,7 +88,7 @@ drift by 2 %: 7 to 145 times)."""
 COMMON_SLOW = 8.0
 """The same of slow drifts: in sound scans up to 30 times in seven patterns together (drifts by 2 %:
 54 times and more)."""
-_TINY = torch.finfo(torch.float64).tiny
+_TINY = torch.finfo(torch.float32).tiny
 """What a weight is divided by that is 0."""
 _LARGE = 1e5
 """Mean from which on the tails of χ² are those of a transformed normal."""
@@ -146,13 +146,14 @@ def residual_test(
             "residual, weights and fitted must have one shape (views, rows, columns), got "
             f"{tuple(residual.shape)}, {tuple(weights.shape)} and {tuple(fitted.shape)}"
         )
-    w = weights.double()
+    # Readings are compared in their own precision, of their sums the tests are double.
+    w = weights.to(torch.promote_types(residual.dtype, torch.float32))
     count = int((w > 0).sum())
     if not bool((w >= 0).all()) or count == 0:
         raise ValueError(
             "weights must be 0 or more, and some greater than 0: give inverse variances"
         )
-    r, lines = (torch.where(w > 0, v.double(), 0.0) for v in (residual, fitted))
+    r, lines = (torch.where(w > 0, v.to(w.dtype), 0.0) for v in (residual, fitted))
     if not bool(torch.isfinite(r).all() and torch.isfinite(lines).all()):
         raise ValueError("residual and fitted must be finite where the weight is not 0")
     wr = w * r
@@ -227,7 +228,7 @@ def residual_test(
     # A view at another angle differs by a part of what neighbouring views do.
     turned = torch.zeros_like(lines)
     turned[1:-1] = (lines[2:] - lines[:-2]) / 2.0
-    weight, total = (w * turned.square()).sum(1), (wr * turned).sum(1)
+    weight, total = _sum(w * turned.square(), 1), _sum(wr * turned, 1)
     if bool((weight > 0).any()):
         tolerated = ANGLE_TOLERANCE**2 * float(weight.sum())
         p_values["angles"] = _in_common(total, weight, None, tolerated)
@@ -261,16 +262,16 @@ def residual_test(
         if name == "views" and len(w) > 4 * _HARMONICS:
             patterns.append(_slow(len(w)))
         # Whatever lies off in rows that end in others, by more than all that voxels leave.
-        weight = inner.sum(axes)
-        noise = (inner * of_voxels).sum(axes) + of_cells * _cells_squared(inner, name).sum(-1)
+        weight = _sum(inner, axes)
+        noise = _sum(inner * of_voxels, axes) + of_cells * _sum(_cells_squared(inner, name), -1)
         noisier = 1.0 + noise / weight.clamp_min(_TINY)
-        weight, total = weight / noisier, (inner * r).sum(axes) / noisier
+        weight, total = weight / noisier, _sum(inner * r, axes) / noisier
         tolerated = gain**2 * float(weight.sum()) + leaks
         tails = [_upper_tail(*_alike(total, weight, p), tolerated) for p in patterns]
         # What all columns have in common, by more than voxels leave: that differs among them.
         seen, total = _beside_object(level_rows, r, lines, name)
-        weight, total = seen.sum(axes[0]), total.sum(axes[0])
-        noise = of_cells * _cells_squared(seen, name).sum(-1, keepdim=True)
+        weight, total = _sum(seen, axes[0]), _sum(total, axes[0])
+        noise = of_cells * _sum(_cells_squared(seen, name), -1)[:, None]
         noisier = 1.0 + noise / weight.sum(1, keepdim=True).clamp_min(_TINY)
         weight, total = weight / noisier, total / noisier
         # Faces in some rows leave gains of others, alike in all columns; of views they do not.
@@ -278,15 +279,19 @@ def residual_test(
         tails += [_in_common(total, weight, p, tolerated) for p in patterns]
         p_values[name] = float(min(1.0, parts * min(tails)))
         if p_values[name] < level:
-            weight = level_rows.sum(axes)
+            weight = _sum(level_rows, axes)
             known = weight > 0
-            size = float((level_r.sum(axes)[known] / weight[known]).square().mean().sqrt())
+            size = float((_sum(level_r, axes)[known] / weight[known]).square().mean().sqrt())
             findings.append(
                 f"the readings of some {name} lie above or below what the volume projects to, "
                 f"{100 * size:.2g} % of intensity (root mean square): "
                 f"{_cause(name, level_rows, level_r, lines, axes)}"
             )
     return ResidualTest(chi2, p_values, sizes, tuple(findings))
+
+
+def _sum(values: Tensor, axes: int | tuple[int, ...]) -> Tensor:
+    return values.sum(axes).double()
 
 
 def _steps(lines: Tensor, axis: int) -> Tensor:
@@ -308,7 +313,7 @@ def _gain_variance(weight: Tensor, total: Tensor) -> float:
         weight: ``(views, rows, columns)``.
         total: weight times residual.
     """
-    cells, off = weight.sum(0), total.sum(0)
+    cells, off = _sum(weight, 0), _sum(total, 0)
     gains = off / cells
     bend = gains[:, :-2] - 2.0 * gains[:, 1:-1] + gains[:, 2:]
     of_noise = (1.0 / cells[:, :-2]) + 4.0 / cells[:, 1:-1] + 1.0 / cells[:, 2:]
@@ -324,7 +329,7 @@ def _gain_variance(weight: Tensor, total: Tensor) -> float:
 def _gains(weight: Tensor, total: Tensor, variance: float) -> float:
     """What gains of cells add to the sum of χ²: those of this variance, and of all that are
     constant over the views as far as :data:`GAIN_TOLERANCE` goes."""
-    cells, off = weight.sum(0), total.sum(0)
+    cells, off = _sum(weight, 0), _sum(total, 0)
     known = cells > 0
     excess = float((off[known].square() / cells[known] - 1.0).sum())
     return min(max(excess, 0.0), max(GAIN_TOLERANCE**2, variance) * float(cells.sum()))
@@ -360,9 +365,9 @@ def _cause(name: str, w: Tensor, wr: Tensor, lines: Tensor, axes: tuple[int, int
     limit = torch.quantile(seen[:: max(1, seen.numel() // 10**6)], _DENSE)
     sizes = []
     for part in (lines <= limit, lines > limit):
-        weight = (w * part).sum(axes)
+        weight = _sum(w * part, axes)
         known = weight > 0
-        off = (wr * part).sum(axes)[known] / weight[known]
+        off = _sum(wr * part, axes)[known] / weight[known]
         sizes.append(
             math.sqrt(max(float((off.square() - 1.0 / weight[known]).mean()), 0.0))
             if known.any()
@@ -407,7 +412,7 @@ def _alike(total: Tensor, weight: Tensor, patterns: Tensor | None) -> tuple[floa
 def _cells_squared(weight: Tensor, name: str) -> Tensor:
     """Squares of what a gain of each cell, constant over the views, adds to the sum of a view or
     row of ``(views, rows, columns)``: ``(views, cells)`` or ``(rows, columns)``."""
-    return weight.square().flatten(1) if name == "views" else weight.sum(0).square()
+    return weight.square().flatten(1) if name == "views" else _sum(weight, 0).square()
 
 
 def _beside_object(weight: Tensor, r: Tensor, lines: Tensor, name: str) -> tuple[Tensor, Tensor]:
@@ -419,21 +424,29 @@ def _beside_object(weight: Tensor, r: Tensor, lines: Tensor, name: str) -> tuple
     """
     if lines.shape[1] == 1:
         return weight, weight * r
+    if name == "views":
+        seen, left = weight.clone(), weight * r
+        for row in ([0], [-1]):
+            seen[:, row], left[:, row] = _beside_lines(weight[:, row], r[:, row], lines[:, row])
+        return seen, left
+    return _beside_lines(weight, r, lines)
+
+
+def _beside_lines(weight: Tensor, r: Tensor, lines: Tensor) -> tuple[Tensor, Tensor]:
+    """The part of :func:`_beside_object` that fits gain and part of the object together, in every
+    view and row; of the gain's information a share is left."""
 
     def total(values: Tensor) -> Tensor:
         return (weight * values).sum(2, keepdim=True)
 
-    # Gain and part of the object are fitted together; of the gain's information a share is left.
     power = total(lines.square()).clamp_min(_TINY)
-    pattern = 1.0 - lines * total(lines) / power
+    pattern = 1.0 - lines * (total(lines) / power)
     known = total(pattern.square())
     gain = total(pattern * r) / known.clamp_min(_TINY)
-    left = r - lines * total(lines * (r - gain)) / power
+    left = r - lines * (total(lines * (r - gain)) / power)
     share = known / weight.sum(2, keepdim=True).clamp_min(_TINY)
-    if name == "views":
-        share[:, 1:-1] = 1.0
-        left[:, 1:-1] = r[:, 1:-1]
-    return weight * share, weight * share * left
+    seen = weight * share
+    return seen, seen * left
 
 
 def _in_common(total: Tensor, weight: Tensor, patterns: Tensor | None, tolerated: float) -> float:
