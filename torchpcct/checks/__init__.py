@@ -2,7 +2,8 @@
 have caused.
 
 :mod:`~.defects` finds readings that no object can cause and interpolates them (``repair_defects``).
-:mod:`~.readings` finds readings that are not what they are described as (``reading_warnings``).
+:mod:`~.readings` finds readings that are not what they are described as (``reading_warnings``),
+:mod:`~.floor` among them those that were clipped at a lowest value.
 :mod:`~.conjugate_rays` (``geometry_test``) and :mod:`~.moments` (``moment_test``) test the
 description of the geometry, of full and of half turns; :mod:`~.rotation_axis` measures where the
 axis is. What a volume leaves of its data is tested by :func:`torchpcct.metrics.residual_test`.

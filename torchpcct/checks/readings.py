@@ -1,5 +1,5 @@
-"""Checks of readings by themselves: too bright, clipped, above an offset, almost no signal, or no
-counts at all.
+"""Checks of readings by themselves: too bright, clipped at either end, above an offset, almost no
+signal, or no counts at all.
 
 The description of a scan can be wrong in ways that no shape or sign shows, and FBP reconstructs it
 all the same: water of -750 HU from transmissions given as counts. What speaks against a description
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpcct.checks.floor import clipped_floor
 from torchpcct.readings import DIM, FEWEST, MEDIAN_TO_SD, smoothed
 from torchpcct.scan import Scan
 
@@ -59,6 +60,8 @@ _BRIGHT = 0.85
 """Part of the brightest mean above which readings are bright."""
 _DARK = 0.2
 """Part of the brightest mean below which readings are dark."""
+_TOGETHER = (16, 4)
+"""Views and columns whose mean tells whether readings are brighter than air."""
 _LEAST_COLUMNS = 24
 """Columns of a detector that is tested."""
 _LEAST_VIEWS = 16
@@ -72,7 +75,7 @@ def reading_warnings(scan: Scan) -> list[str]:
 
     Args:
         scan: of any geometry, without energy bins. What was acquired with a known surround is only
-            tested for light.
+            tested for light and for a lowest value.
 
     Returns:
         One sentence for each finding; empty if there is none.
@@ -81,28 +84,33 @@ def reading_warnings(scan: Scan) -> list[str]:
     if scan.noise_free or scan.counts.ndim > len(g.shape) + (not g.has_rows):
         return []
     dim = [] if scan.logged else without_light(scan)
-    if scan.window is not None or g.columns < _LEAST_COLUMNS or g.views < _LEAST_VIEWS:
+    if g.columns < _LEAST_COLUMNS or g.views < _LEAST_VIEWS:
         return dim
     stack = g.has_rows or scan.counts.ndim == 2
 
     def by_view(values: Tensor) -> NDArray[np.float64]:
         """``(views, rows, columns)``, some of the rows, NaN where dead."""
         live = values if scan.dead is None else values.masked_fill(scan.dead, math.nan)
-        shaped = (live if stack else live.movedim(0, 1)).reshape(g.views, -1, g.columns)
+        shaped = (live if stack else live.movedim(0, 1)).reshape(g.views, -1, values.shape[-1])
         return shaped[:, :: max(1, math.ceil(values.numel() / _MOST))].double().numpy()
 
-    lines = by_view(scan._logarithm())
-    inverted = _no_counts(lines)
-    if inverted:  # nothing else is to be believed then
-        return inverted
-    if scan.logged:
-        return _other_base(lines) + _brighter_than_air(lines)
     counts = by_view(scan.counts)
     quantum = 1.0 if scan.quantum is None else float(scan.quantum.median())
+    if scan.window is not None:
+        return dim + _at_the_floor(counts, quantum)
+    lines = by_view(scan._logarithm())
+    floor = _at_the_floor(counts, quantum)
+    flux = 1.0 if scan.flux is None else scan._per_view(scan.flux)
+    shone = by_view(scan.counts / (scan._at_window(scan.air) * flux))
+    inverted = _no_counts(lines, shone)
+    if inverted:  # of the rest nothing is to be believed then
+        return inverted + floor
+    if scan.logged:
+        return floor + _other_base(lines) + _brighter_than_air(-lines, logarithms=True)
     # Of transmissions the noise says nothing of the photons in each cell.
     unknown = str(scan.info.get("signal_of_one_photon_from")).startswith("noise")
     transfer = [] if unknown else _transfer_texts(counts, quantum)
-    return dim + (_clipped(counts, quantum) or transfer or _brighter_than_air(lines))
+    return dim + (floor or _clipped(counts, quantum) or transfer or _brighter_than_air(shone))
 
 
 def without_light(scan: Scan) -> list[str]:
@@ -130,9 +138,16 @@ def without_light(scan: Scan) -> list[str]:
     ]
 
 
-def _no_counts(lines: NDArray[np.float64]) -> list[str]:
+def _no_counts(lines: NDArray[np.float64], transmissions: NDArray[np.float64]) -> list[str]:
     """Whether the object is brighter than what surrounds it."""
     bright = float((lines < -math.log(1.5)).mean())
+    if bright > 0.05:  # single readings of a few photons may be by their noise
+        views, columns = (n // k for n, k in zip(lines.shape[::2], _TOGETHER, strict=True))
+        some = transmissions[: views * _TOGETHER[0], :, : columns * _TOGETHER[1]]
+        blocks = some.reshape(views, _TOGETHER[0], -1, columns, _TOGETHER[1])
+        mean = _mean(blocks, (1, 4))
+        spread = np.sqrt(np.maximum(_mean(blocks**2, (1, 4)) - mean**2, 0.0))
+        bright = float((mean - 3.0 * spread / math.sqrt(math.prod(_TOGETHER)) > 1.5).mean())
     if bright > 0.05:
         return [
             f"{100 * bright:.0f} % of the readings are more than 1.5 times as bright as air: air, "
@@ -151,18 +166,20 @@ def _no_counts(lines: NDArray[np.float64]) -> list[str]:
     return []
 
 
-def _brighter_than_air(lines: NDArray[np.float64]) -> list[str]:
-    """Whether the rays beside the object read more than air does."""
+def _brighter_than_air(transmissions: NDArray[np.float64], logarithms: bool = False) -> list[str]:
+    """Whether the rays beside the object read more than air does, by their transmissions, or, where
+    only those are known, by the ``logarithms``: of few photons their mean is not that of a beam."""
     # The darker end of each view; views differ by the tube, so that the spread is theirs.
-    view = np.max(np.stack([_mean(side, (1, 2)) for side in _ends(lines)]), axis=0)
+    view = np.min(np.stack([_mean(side, (1, 2)) for side in _ends(transmissions)]), axis=0)
+    view = np.exp(view) if logarithms else view
     view = view[np.isfinite(view)]
     if not view.size:
         return []
-    size, spread = float(view.mean()), float(view.std()) / math.sqrt(view.size)
-    if not size < -max(AIR_TOLERANCE, 5.0 * spread):
+    excess, spread = float(view.mean()) - 1.0, float(view.std()) / math.sqrt(view.size)
+    if not excess > max(AIR_TOLERANCE, 5.0 * spread):
         return []
     return [
-        f"the rays beside the object are {100 * math.expm1(-size):.2g} % brighter than air: an "
+        f"the rays beside the object are {100 * excess:.2g} % brighter than air: an "
         "offset (dark=) or scatter adds to the readings, or the beam is not that of the air frame "
         "(flux=); the object reads too low"
     ]
@@ -235,6 +252,23 @@ def _mean(values: NDArray[np.float64], axes: tuple[int, ...]) -> NDArray[np.floa
     number = known.sum(axes)
     total = np.where(known, values, 0.0).sum(axes)
     return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+
+
+def _at_the_floor(counts: NDArray[np.float64], quantum: float) -> list[str]:
+    """Whether readings were clipped at their lowest value."""
+    floor = clipped_floor(counts, quantum)
+    if not floor.clipped:
+        return []
+    where = "are marked as dead" if math.isnan(floor.value) else f"read {floor.value:.3g}"
+    how = "left out" if math.isnan(floor.value) else "clipped there"
+    return [
+        f"{100 * floor.share:.2g} % of the readings {where}, {100 * floor.excess:.2g} % more than "
+        f"photons leave dark beside readings of several photons: lower ones were {how} (negative "
+        "ones, after the dark was taken off?), the darkest rays read too bright and what they pass "
+        "too low; give the readings as they were before, negative ones too, with dark= or "
+        "electronic_noise=, or, where those are lost, mask the whole shadow (dead=) or scan at a "
+        "higher exposure"
+    ]
 
 
 def _clipped(counts: NDArray[np.float64], quantum: float) -> list[str]:

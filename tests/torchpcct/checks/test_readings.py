@@ -166,6 +166,20 @@ def test_sound_scans_are_not_accused(kind, air):
     assert (found, reading_warnings(fixed)) == ([], [])
 
 
+def test_few_photons_in_air_are_not_brighter_than_air():
+    """Every sixth reading of three photons is more than 1.5 times as bright as they are."""
+    for air in (2.5, 4.0):
+        found = warnings_of(counted(np.sqrt(SHONE), air=air), air=air)
+        assert not any("bright as air" in text for text in found)
+    (found,) = warnings_of(counted(np.sqrt(SHONE), air=8.0), air=4.0)
+    assert "bright as air" in found
+    # Electronic noise above the signal: the mean is that of air, that of the logarithm is not.
+    noisy = counted(np.sqrt(SHONE), air=9.0)
+    noisy += 8.0 * np.random.default_rng(1).standard_normal(SHONE.shape)
+    found = warnings_of(noisy, air=9.0, electronic_noise=8.0)
+    assert not any("brighter than air" in text for text in found)
+
+
 def without_lost(shone, share, prolonged, seed=0):
     """Counts of a detector that loses a share of those in air to its dead time, of the variance
     that leaves (binomial), over those in air."""
