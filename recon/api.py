@@ -26,6 +26,7 @@ from torchpcct.scan import Scan
 from torchpcct.scan_grid import finite_cells
 from torchpcct.scan_memory import once
 from torchpcct.validate import checked
+from torchpcct.vector_geometry import check_motion
 from torchpcct.volume import Volume, from_hu
 
 if TYPE_CHECKING:
@@ -153,7 +154,9 @@ def reconstruct(
             its displacement in every view, ``(views, 3)`` z, y, x mm; ``"estimate"``: from the
             readings themselves (:func:`recon.motion.estimate_motion`), with the path, its errors
             and whether the readings hold it under ``motion`` in the report, scan by scan; or what
-            that found. The volume shows the inset at rest, where its displacement is zero.
+            that found. The volume shows the inset at rest, where its displacement is zero; the
+            tests of the scan look at its readings as they would be then, so that a motion that is
+            not theirs is named.
         options: of the method (:class:`MethodOptions`).
 
     Readings that no object can cause (dead or hot cells, dead views, lost readings:
@@ -236,12 +239,13 @@ def reconstruct(
     if motion is not None:
         said, moves = _moving(motion, name, scans[0], grid, chosen)
         whole = [(s, [*texts, *said]) for s, texts in whole]
+    path = chosen.get("motion", getattr(chosen.get("problem"), "motion", None))
     found_of = methods[name](scans, grid, progress or (lambda _: None), **chosen)
     for batch in _within_memory(found_of, there):
         seconds = round((time.perf_counter() - began) / len(batch), 3)
         for solution in batch:
             s, before = whole[len(volumes)]
-            volume, report, found = _finished(s, grid, solution)
+            volume, report, found = _finished(s, grid, solution, path)
             report |= moves | {
                 "seconds": seconds,
                 "cells_mm": finite_cells(s.geometry),
@@ -350,15 +354,17 @@ def _prepared(scan: Scan) -> tuple[Scan, list[str]]:
     return scan if repaired is None else repaired, texts
 
 
-def _consistency(scan: Scan, grid: VolumeGrid) -> list[str]:
-    return once(scan, "consistency", lambda: consistency_warnings(scan, grid), grid)
+def _consistency(scan: Scan, grid: VolumeGrid, motion: object) -> list[str]:
+    path = None if motion is None else check_motion(motion, scan.geometry.views, 3)
+    key = None if path is None else path.tobytes()
+    return once(scan, "consistency", lambda: consistency_warnings(scan, grid, path), grid, key)
 
 
 def _finished(
-    scan: Scan, grid: VolumeGrid, solution: Result
+    scan: Scan, grid: VolumeGrid, solution: Result, motion: object
 ) -> tuple[Tensor, JsonObject, list[str]]:
     """The volume in the scan's unit, the report with what the tests of the data say, and all
-    warnings."""
+    warnings; ``motion`` of the inset that the method took into account, or None."""
     values, report, tests = solution.volume.to(torch.float32), dict(solution.report), solution.tests
     if tests:
         report.setdefault("chi2", sum(t.chi2 for t in tests) / len(tests))
@@ -367,7 +373,7 @@ def _finished(
         }
     failed: list[str] = []
     consistency = tested(
-        "the test of the scan against its description", failed, _consistency, scan, grid
+        "the test of the scan against its description", failed, _consistency, scan, grid, motion
     )
     found = [text for texts in consistency for text in texts]
     found += [*solution.warnings, *(text for t in tests for text in t.findings)]

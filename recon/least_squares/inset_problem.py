@@ -57,6 +57,7 @@ class InsetProblem:
     counts behind it by a few per cent only.
 
     Attributes:
+        motion: displacement of the inset in every view (:meth:`with_motion`), or None.
         weights: on ``window``, at 1 s, of line integrals in mm⁻¹ · mm.
         model: of AᵀWA at 1 s, :func:`recon.least_squares.pwls.data_model`.
 
@@ -123,6 +124,7 @@ class InsetProblem:
 
     def _place(self, motion: ArrayLike | None) -> None:
         geometry, grid = self.geometry, self.grid
+        self.motion = motion
         self.window = footprint(geometry, grid, margin=1, motion=motion)
         self.weights = self.window.take(self._cell_weights).contiguous()
         self.projector = Projector(geometry, grid, self.window, motion)

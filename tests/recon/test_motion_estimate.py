@@ -10,9 +10,11 @@ import torch
 from refusals import refused
 
 import recon
+from recon.analytic.coverage import _at_rest, _seen_at, consistency_warnings
 from recon.analytic.inset import InsetFbp, view_motion
+from recon.least_squares.inset_problem import InsetProblem
 from recon.motion import estimate_motion
-from torchpcct import FanBeam, Scan, VolumeGrid, acquire, full_turn
+from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, acquire, full_turn
 from torchpcct.scanner import presets
 from torchpcct.scene import Body, Scene, SinusoidalMotion
 from torchpcct.scene.bodies import Ellipsoid, EllipticCylinder
@@ -64,6 +66,61 @@ def test_a_moving_inset_is_followed_and_shown_at_rest(moving):
     assert off[0] < 0.25 * off[1]
     again = recon.reconstruct(scan, GRID, motion=path)
     torch.testing.assert_close(again.data, volume.data, rtol=0, atol=0.5)
+    for still in (volume, again):  # taken out of what the tests of the scan see, too
+        assert not any("object moved" in text for text in still.report["warnings"])
+
+
+def test_a_motion_that_is_not_that_of_the_readings_is_named(moving):
+    scan, truth = moving.with_noise(EXPOSURE_S, 0), _truth(moving)[1]
+    assert consistency_warnings(scan, GRID, truth) == []
+    (ignored,) = consistency_warnings(scan, GRID)
+    assert "the object moved" in ignored
+    for wrong in (-truth, truth[:, [0, 2, 1]], truth[::-1]):
+        (text,) = consistency_warnings(scan, GRID, wrong)
+        assert "the object moved" in text
+        assert "its sign, the order z, y, x" in text
+    (said,) = (t for t in reconstruct_said(scan, -truth) if "object moved" in t)
+    assert "with the given motion taken out" in said
+    rest = _scan().with_noise(EXPOSURE_S, 1)
+    assert consistency_warnings(rest, GRID, np.zeros_like(truth)) == []
+    assert len(consistency_warnings(rest, GRID, truth)) == 1
+
+
+def reconstruct_said(scan, motion, **options):
+    return recon.reconstruct(scan, GRID, motion=motion, **options).report["warnings"]
+
+
+@pytest.mark.extended
+def test_a_problem_that_moves_is_tested_along_its_motion(moving):
+    scan, truth = moving.with_noise(EXPOSURE_S, 0), _truth(moving)[1]
+    for sign, said in ((1.0, False), (-1.0, True)):
+        problem = InsetProblem(scan, GRID).with_motion(sign * truth)
+        found = recon.reconstruct(scan, GRID, "pwls", problem=problem).report["warnings"]
+        assert any("object moved" in text for text in found) is said
+
+
+@pytest.mark.parametrize("detector", ["flat", "curved"])
+def test_readings_are_moved_to_where_they_would_be_at_rest(detector):
+    """A point's shadow in every view, of a cone beam and of a parallel one."""
+    cone = ConeBeam(full_turn(7), 400.0, 700.0, 70, 50, (0.7, 0.8), detector=detector)
+    parallel = ParallelBeam(full_turn(7), 70, 0.8)
+    about, motion = (3.0, -5.0), np.random.default_rng(0).uniform(-2, 2, (7, 3))
+    for g in (cone, parallel):
+        shapes = [g.row_positions, g.column_positions][-1 - g.has_rows :]
+
+        def shadow(points, g=g, axes=shapes):
+            # A smooth spot where the point is seen.
+            seen = _seen_at(g, points)[:, -len(axes) :]
+            at = [a - seen[:, k, None] for k, a in enumerate(axes)]
+            spots = [np.exp(-0.5 * (a / 3.0) ** 2) for a in at]
+            return torch.from_numpy(
+                spots[0] if len(spots) == 1 else spots[0][:, :, None] * spots[1][:, None, :]
+            )
+
+        moved, rest = (shadow(np.array((0.0, *about)) + m) for m in (motion, 0.0 * motion))
+        assert float((moved - rest).abs().max()) > 0.2
+        found = _at_rest(moved, g, about, motion)
+        torch.testing.assert_close(found, rest, rtol=0, atol=0.02)
 
 
 def test_no_motion_is_invented():
