@@ -160,6 +160,7 @@ def test_a_point_is_seen_where_the_other_program_sees_it(name):
         )
 
 
+@pytest.mark.extended
 def test_every_public_name_is_in_the_reference(tmp_path):
     """What ``__all__`` lists, asked of the imported modules, against the pages that Sphinx gets."""
     from pages import public_modules, write_api

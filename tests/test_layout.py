@@ -4,12 +4,14 @@ Imports count wherever they stand: at the top, in a function, and for the type c
 """
 
 import ast
+import functools
 import itertools
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("torchpcct", "recon", "train")
+IMPORTERS = ("import_module", "__import__", "run_module")
 
 
 def _modules():
@@ -43,7 +45,9 @@ def _imports(module):
     return {name for name in names if name in MODULES and name != module}
 
 
-GRAPH = {module: _imports(module) for module in MODULES}
+@functools.cache
+def _graph():
+    return {module: _imports(module) for module in MODULES}
 
 
 def _drawn():
@@ -69,17 +73,20 @@ def _package(module):
 
 def _named_in_texts(path):
     """Modules of this repository that are imported by a text: of an f-string its first part."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    source = path.read_text(encoding="utf-8")
+    if not any(name in source for name in IMPORTERS):
+        return
+    for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Call) and node.args:
             function, text = ast.unparse(node.func), node.args[0]
             if isinstance(text, ast.JoinedStr):
                 text = text.values[0]
-            if function.split(".")[-1] in ("import_module", "__import__", "run_module"):
+            if function.split(".")[-1] in IMPORTERS:
                 yield str(getattr(text, "value", ""))
 
 
 def test_no_import_circles():
-    TopologicalSorter(GRAPH).prepare()  # raises CycleError with the modules of a circle
+    TopologicalSorter(_graph()).prepare()  # raises CycleError with the modules of a circle
 
 
 def test_the_drawing_names_all_packages():
@@ -89,7 +96,7 @@ def test_the_drawing_names_all_packages():
 def test_no_import_points_up_or_sideways():
     assert not [
         (module, needed)
-        for module, needs in GRAPH.items()
+        for module, needs in _graph().items()
         for needed in needs
         if _package(needed) != _package(module)
         and LAYERS[_package(needed)] >= LAYERS[_package(module)]

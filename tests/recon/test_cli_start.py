@@ -237,5 +237,6 @@ print(_peak_memory_gib())
 """
 
 
+@pytest.mark.extended
 def test_studies_need_no_module_that_only_unix_has():
     assert run_python(WITHOUT_UNIX).stdout.split() == ["0.0", "0.0"]

@@ -196,6 +196,7 @@ def run_tiny_with(name, settings, folder):
     registry.run(name, made, pieces=folder).save(folder)
 
 
+@pytest.mark.extended
 def test_many_scans_are_reconstructed_as_if_each_were_alone(processes, here, capsys, cli):
     g = ConeBeam(full_turn(24), 300.0, 500.0, 24, 4, 1.0)
     for k in range(3):
@@ -251,8 +252,9 @@ def test_many_scans_go_on_after_an_interruption(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize(
     "where",
-    ["processes", pytest.param("cluster", marks=[pytest.mark.cluster, pytest.mark.extended])],
+    ["processes", pytest.param("cluster", marks=pytest.mark.cluster)],
 )
+@pytest.mark.extended
 def test_slabs_of_a_volume_are_jobs(where, tmp_path, monkeypatch, request):
     """The same file, to the bit, as slab by slab in one process; what was made is made once."""
     g, grid = ConeBeam(full_turn(24), 300.0, 500.0, 24, 12, 1.0), VolumeGrid((10, 12, 12), 0.6)
@@ -484,6 +486,7 @@ def test_a_signal_ends_evaluate(tmp_path, name):
     assert not [p for p in tmp_path.rglob("*.part.*")]
 
 
+@pytest.mark.extended
 def test_what_lies_in_the_current_folder_hides_no_module(tmp_path, monkeypatch):
     """Neither in a process when it starts, nor later; a module of the user's own is found there,
     after all others."""
