@@ -206,7 +206,8 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid, motion: Floats | None = N
 
     Neighbouring views (:mod:`torchpcct.checks.neighbours`: order, missing, stuck, travel) and
     columns (:mod:`torchpcct.checks.columns`: gains, places); conjugate rays
-    (:mod:`torchpcct.checks.conjugate_rays`); where they agree, the moments of the views
+    (:mod:`torchpcct.checks.conjugate_rays`; :mod:`torchpcct.checks.modules`: modules of the
+    detector); where they agree, the moments of the views
     (:mod:`torchpcct.checks.moments`: no line integrals, motion) of a whole field; lines through the
     object that no view measured; rows that end inside the object; and of a window whether its
     borders see the surround, and its cells have one

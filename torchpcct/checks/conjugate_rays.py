@@ -48,6 +48,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpcct.checks.modules import module_test
 from torchpcct.checks.ray_pairs import BLOCKS, RayPairs, product, unwrapped
 from torchpcct.checks.scan_test import UNKNOWN, ScanTest
 from torchpcct.detector_window import DetectorWindow
@@ -134,8 +135,11 @@ def geometry_test(
     Returns:
         The test of ``centre`` (see :func:`centre_test`), ``scale`` (fan angles described too small,
         relative), ``step`` (steps between views described too small, relative), ``roll`` in rad,
-        and ``mismatch``: the mean square of the difference over that of what changes from view to
-        view, noise taken off, 0 of a sound scan, 1 of rays that have nothing to do with each other.
+        ``module`` (columns by which a block of them lies beside its place, of a whole detector;
+        see :mod:`torchpcct.checks.modules`, which names it in place of a centre that ``others``
+        do not show), and ``mismatch``: the mean square of the difference over that of what changes
+        from view to view, noise taken off, 0 of a sound scan, 1 of rays that have nothing to do
+        with each other.
         Of several causes the one that explains most is named, and its size measured again where
         nothing is left of it; the others' are of first order. What is said after ± is twice the
         standard error: 95 % of such errors lie within.
@@ -197,7 +201,18 @@ def geometry_test(
             sizes[name], errors[name] = _measured(name, sizes[name], errors[name], described)
             text = _TEXTS[name](sizes[name], 2.0 * errors[name])
         found.append(text)
+    if window is None:
+        module = module_test(pairs)
+        sizes |= module.sizes
+        errors |= module.errors
+        if module.findings and (not found or _at_their_places(module)):
+            found = [*module.findings]
     return ScanTest(sizes, errors, tuple(found))
+
+
+def _at_their_places(module: ScanTest) -> bool:
+    """Whether all columns but those of a displaced module lie where they are described."""
+    return abs(module.sizes["others"]) < CENTRE_TOLERANCE + 3.0 * module.errors["others"]
 
 
 def _measured(
