@@ -51,6 +51,7 @@ from torch import Tensor
 from torchpcct.checks.modules import module_test
 from torchpcct.checks.ray_pairs import BLOCKS, RayPairs, product, unwrapped
 from torchpcct.checks.scan_test import UNKNOWN, ScanTest
+from torchpcct.checks.view_scatter import view_scatter_test
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry, view_step
 from torchpcct.validate import checked
@@ -137,9 +138,10 @@ def geometry_test(
         relative), ``step`` (steps between views described too small, relative), ``roll`` in rad,
         ``module`` (columns by which a block of them lies beside its place, of a whole detector;
         see :mod:`torchpcct.checks.modules`, which names it in place of a centre that ``others``
-        do not show), and ``mismatch``: the mean square of the difference over that of what changes
-        from view to view, noise taken off, 0 of a sound scan, 1 of rays that have nothing to do
-        with each other.
+        do not show), ``view_scatter`` (standard deviation of the angles about the described ones,
+        in steps; :mod:`torchpcct.checks.view_scatter`), and ``mismatch``: the mean square of the
+        difference over that of what changes from view to view, noise taken off, 0 of a sound scan,
+        1 of rays that have nothing to do with each other.
         Of several causes the one that explains most is named, and its size measured again where
         nothing is left of it; the others' are of first order. What is said after ± is twice the
         standard error: 95 % of such errors lie within.
@@ -207,6 +209,10 @@ def geometry_test(
         errors |= module.errors
         if module.findings and (not found or _at_their_places(module)):
             found = [*module.findings]
+        scatter = view_scatter_test(pairs)
+        sizes |= scatter.sizes
+        errors |= scatter.errors
+        found = found or [*scatter.findings]
     return ScanTest(sizes, errors, tuple(found))
 
 
