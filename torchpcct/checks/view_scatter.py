@@ -30,7 +30,7 @@ __all__ = ["view_scatter_test"]
 SCATTER_TOLERANCE = 0.2
 """Standard deviation of the angles, in steps, that is no finding: of thin walls interpolation
 between views leaves nearly as much."""
-_SIGMAS = 5.0
+_SIGMAS = 5.25
 """Standard errors from which a mean square is none of chance."""
 _CORRELATION = (-0.85, -0.4)
 """Of neighbouring views, of angles that scatter independently: -2/3 and what noise makes of it."""
