@@ -115,7 +115,7 @@ def energy(normal, u):
         ("vessel", "soft", (0.87, 0.68)),
         ("vessel", "standard", (0.72, 0.48)),
         ("vessel", "linear", (0.97, 0.86)),
-        ("fat", "soft", (0.22, 0.17)),
+        ("fat", "soft", (0.22, 0.18)),
         ("fat", "standard", (0.15, 0.12)),
         ("fat", "linear", (0.30, 0.25)),
     ],
@@ -137,7 +137,7 @@ def test_final_data_consistency_makes_the_network_s_volume_explain_the_data(foun
         low_residual(found.normal, found.normal.b - found.normal.apply(u), found.fidelity).max()
         for u in (found.free, found.out)
     ]
-    assert left[1] < 0.4 * left[0]
+    assert left[1] < min(0.5 * left[0], 0.01)
     assert energy(found.normal, found.out) < energy(found.normal, found.free)
 
 
