@@ -48,7 +48,7 @@ from recon.variable_projection import (
     unexplained,
 )
 from torchpcct.detector_window import DetectorWindow, footprint
-from torchpcct.geometry import ConeBeam, VolumeGrid
+from torchpcct.geometry import ConeBeam, VolumeGrid, project_points
 from torchpcct.projector import Projector, with_parameters
 from torchpcct.projector.posed import PosedEngine
 from torchpcct.scan import Scan
@@ -363,11 +363,8 @@ def _averages(groups: list[NDArray[np.int64]], views: int) -> Floats:
 def _centre_columns(geometry: ConeBeam, grid: VolumeGrid) -> Floats:
     """Where the middle of a grid falls in every view, in columns."""
     cy, cx = grid.center[-2:]
-    c, s = np.cos(geometry.angles), np.sin(geometry.angles)
-    across, depth = cy * c - cx * s, geometry.sod - cx * c - cy * s
-    curved = geometry.detector == "curved"
-    at = geometry.sdd * (np.arctan2(across, depth) if curved else across / depth)
-    return np.asarray((at - geometry.column_positions[0]) / geometry.column_pitch)
+    position, _ = project_points(geometry, cx, cy)
+    return np.asarray((position - geometry.column_positions[0]) / geometry.column_pitch)
 
 
 def _aligned(

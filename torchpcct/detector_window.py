@@ -12,7 +12,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, VolumeGrid, beam
+from torchpcct.geometry import (
+    ConeBeam,
+    Geometry,
+    ParallelBeam,
+    VolumeGrid,
+    beam,
+    project_points,
+)
 from torchpcct.validate import checked, whole
 from torchpcct.vector_geometry import VectorGeometry, check_motion
 
@@ -222,45 +229,29 @@ def footprint(
         else check_motion(motion, geometry.views, grid.ndim)
     )
     x, y = corners[:, 0] + shift[:, -1:], corners[:, 1] + shift[:, -2:-1]  # (views, 4)
-    along = x * np.cos(beta) + y * np.sin(beta)  # (views, 4), towards the source
-    across = -x * np.sin(beta) + y * np.cos(beta)
-    first_row, rows = 0, 1
-    position, pitch = across, geometry.column_pitch
     if not isinstance(geometry, ParallelBeam):
-        depth = geometry.sod - along
+        depth = geometry.sod - (x * np.cos(beta) + y * np.sin(beta))
         if depth.min() <= 0:
             raise ValueError(
                 f"the grid reaches {grid.in_plane_radius:.1f} mm from the axis, beyond the source "
                 f"orbit (sod {geometry.sod} mm): move or shrink the grid"
             )
-        if geometry.detector == "curved":
-            position = geometry.sdd * np.arctan2(across, depth)
-        else:
-            position = geometry.sdd * across / depth
-        if isinstance(geometry, ConeBeam):
-            reach = (
-                np.array([grid.center[0] - gz, grid.center[0] + gz])
-                if grid.ndim == 3
-                else np.zeros(2)
+    # Lower and upper end.
+    reach = np.array([grid.center[0] - gz, grid.center[0] + gz]) if grid.ndim == 3 else np.zeros(2)
+    z = reach[:, None, None] + (shift[:, :1] if grid.ndim == 3 else 0.0)
+    position, height = project_points(geometry, x, y, z)
+    first_row, rows = 0, 1
+    if isinstance(geometry, ConeBeam):
+        row0 = (height.min() - geometry.row_positions[0]) / geometry.row_pitch - 0.5
+        row1 = (height.max() - geometry.row_positions[0]) / geometry.row_pitch + 0.5
+        if row1 < 0.0 or row0 > geometry.rows - 1:
+            raise ValueError(
+                f"the grid (z = {reach[0]:g} … {reach[1]:g} mm) lies above or below all "
+                f"{geometry.rows} rows in every view: move it along z"
             )
-            # On a curved detector the height follows the slant in-plane distance, on a flat one the
-            # depth.
-            distance = np.hypot(across, depth) if geometry.detector == "curved" else depth
-            v = (
-                geometry.sdd
-                * (reach[:, None, None] + (shift[:, :1] if grid.ndim == 3 else 0.0))
-                / distance
-            )
-            row0 = (v.min() - geometry.row_positions[0]) / geometry.row_pitch - 0.5
-            row1 = (v.max() - geometry.row_positions[0]) / geometry.row_pitch + 0.5
-            if row1 < 0.0 or row0 > geometry.rows - 1:
-                raise ValueError(
-                    f"the grid (z = {reach[0]:g} … {reach[1]:g} mm) lies above or below all "
-                    f"{geometry.rows} rows in every view: move it along z"
-                )
-            first_row = int(np.clip(math.floor(row0), 0, geometry.rows - 1))
-            rows = int(np.clip(math.ceil(row1), first_row, geometry.rows - 1)) - first_row + 1
-    index = (position - geometry.column_positions[0]) / pitch
+        first_row = int(np.clip(math.floor(row0), 0, geometry.rows - 1))
+        rows = int(np.clip(math.ceil(row1), first_row, geometry.rows - 1)) - first_row + 1
+    index = (position - geometry.column_positions[0]) / geometry.column_pitch
     low, high = index.min(axis=1), index.max(axis=1)
     if low.min() < -0.5 - 1e-9 or high.max() > geometry.columns - 0.5 + 1e-9:
         raise ValueError(

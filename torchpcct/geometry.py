@@ -507,6 +507,29 @@ Beam: TypeAlias = ParallelBeam | FanBeam | ConeBeam
 """A scan on a circle."""
 
 
+def project_points(
+    geometry: Beam, x: Floats | float, y: Floats | float, z: Floats | float = 0.0
+) -> tuple[Floats, Floats]:
+    """Where points fall on the detector in every view, in mm: position along the columns, height.
+
+    Args:
+        geometry: parallel, fan or cone beam.
+        x, y: mm, ``(views, …)``, or one number for all views; they lie before the source.
+        z: mm, of a shape that broadcasts with theirs.
+    """
+    x, y, z = (np.asarray(v, dtype=np.float64) for v in (x, y, z))
+    trailing = (1,) * (max(x.ndim, y.ndim, 1) - 1)
+    c, s = (f(geometry.angles).reshape(-1, *trailing) for f in (np.cos, np.sin))
+    across = y * c - x * s
+    if isinstance(geometry, ParallelBeam):
+        return across, z
+    depth = geometry.sod - (x * c + y * s)
+    # On a curved detector the height follows the slant in-plane distance, on a flat one the depth.
+    if geometry.detector == "curved":
+        return geometry.sdd * np.arctan2(across, depth), geometry.sdd * z / np.hypot(across, depth)
+    return geometry.sdd * across / depth, geometry.sdd * z / depth
+
+
 def beam(geometry: Geometry) -> Beam:
     """The geometry, where it must be one on a circle.
 

@@ -17,7 +17,14 @@ from recon.analytic.detector_edges import cut_off
 from torchpcct.angles import OPEN_GAP_STEPS, SAME_VIEW, is_offset
 from torchpcct.checks.defects import BRIGHT
 from torchpcct.detector_window import footprint
-from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid, beam, view_step
+from torchpcct.geometry import (
+    ConeBeam,
+    Geometry,
+    VolumeGrid,
+    beam,
+    project_points,
+    view_step,
+)
 from torchpcct.scan import Scan
 from torchpcct.validate import checked
 from torchpcct.vector_geometry import VectorGeometry, check_motion
@@ -302,29 +309,14 @@ def _at_rest(lines: Tensor, geometry: Any, about: tuple[float, float], motion: F
         about: (y, x) of the inset's middle, mm.
         motion: ``(views, 3)`` z, y, x mm.
     """
-    rest, moved = (
-        _seen_at(geometry, np.asarray((0.0, *about)) + shift) for shift in (np.zeros(3), motion)
-    )
-    pitches = (geometry.row_pitch, geometry.pitch[1]) if geometry.has_rows else (geometry.pitch,)
-    for axis, pitch in enumerate(reversed(pitches), start=1):
-        shift = torch.from_numpy((moved[:, -axis] - rest[:, -axis]) / pitch)
+    y, x = about
+    rest = project_points(geometry, x, y)
+    moved = project_points(geometry, x + motion[:, 2], y + motion[:, 1], motion[:, 0])
+    pitches = (geometry.column_pitch, geometry.row_pitch)[: lines.ndim - 1]
+    for axis, (pitch, there, here) in enumerate(zip(pitches, moved, rest, strict=False), start=1):
+        shift = torch.from_numpy((there - here) / pitch)
         lines = _shifted(lines, shift.to(lines.dtype), -axis)
     return lines
-
-
-def _seen_at(geometry: Any, points: Floats) -> Floats:
-    """Where a point ``(views, 3)`` or ``(3,)`` z, y, x mm of every view is seen on the detector:
-    height and position along the columns, ``(views, 2)`` mm."""
-    z, y, x = np.broadcast_to(points, (geometry.views, 3)).T
-    c, s = np.cos(geometry.angles), np.sin(geometry.angles)
-    across = y * c - x * s
-    if geometry.parallel:
-        return np.stack([z, across], 1)
-    depth = geometry.sod - x * c - y * s
-    if geometry.detector == "curved":
-        place = geometry.sdd * np.arctan2(across, depth)
-        return np.stack([geometry.sdd * z / np.hypot(across, depth), place], 1)
-    return np.stack([geometry.sdd * z / depth, geometry.sdd * across / depth], 1)
 
 
 def _shifted(values: Tensor, shift: Tensor, axis: int) -> Tensor:

@@ -10,12 +10,13 @@ import torch
 from refusals import refused
 
 import recon
-from recon.analytic.coverage import _at_rest, _seen_at, consistency_warnings
+from recon.analytic.coverage import _at_rest, consistency_warnings
 from recon.analytic.inset import InsetFbp, view_motion
 from recon.least_squares.inset_problem import InsetProblem
 from recon.motion import _believed, _Problem, estimate_motion
 from recon.variable_projection import Normal
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, acquire, full_turn
+from torchpcct.geometry import project_points
 from torchpcct.scanner import presets
 from torchpcct.scene import Body, Scene, SinusoidalMotion
 from torchpcct.scene.bodies import Ellipsoid, EllipticCylinder
@@ -111,8 +112,9 @@ def test_readings_are_moved_to_where_they_would_be_at_rest(detector):
 
         def shadow(points, g=g, axes=shapes):
             # A smooth spot where the point is seen.
-            seen = _seen_at(g, points)[:, -len(axes) :]
-            at = [a - seen[:, k, None] for k, a in enumerate(axes)]
+            z, y, x = points.T
+            seen = project_points(g, x, y, z)[: len(axes)]
+            at = [a - v[:, None] for a, v in zip(axes, reversed(seen), strict=True)]
             spots = [np.exp(-0.5 * (a / 3.0) ** 2) for a in at]
             return torch.from_numpy(
                 spots[0] if len(spots) == 1 else spots[0][:, :, None] * spots[1][:, None, :]

@@ -23,9 +23,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from torchpcct.checks.ray_pairs import BLOCKS, RayPairs
+from torchpcct.checks.ray_pairs import BLOCKS, RayPairs, varying
 from torchpcct.checks.scan_test import UNKNOWN, ScanTest
 
 __all__ = ["module_test"]
@@ -97,16 +96,10 @@ def _profile(pairs: RayPairs) -> tuple[Floats, Floats, int, int]:
     blocks of views; the first column, and how many a group has."""
     smooth, raw, known = pairs.slopes("columns", _SLOPE_COLUMNS)
     kept = known.double()
-    number = kept.sum(0, keepdim=True).clamp(min=1.0)
-
-    def varying(values: Tensor) -> Tensor:
-        """Without the mean over the views."""
-        v = values.double() * kept
-        return (v - v.sum(0, keepdim=True) / number) * kept
-
-    slopes, own = [varying(v) for v in smooth], [varying(v) for v in raw]
+    # Without what is the same in all views.
+    slopes, own = ([varying(v, kept, 0) for v in both] for both in (smooth, raw))
     # Of a shift the difference is -2 times the slope.
-    score = -varying(pairs.residue) * (slopes[0] + slopes[1])
+    score = -varying(pairs.residue, kept, 0) * (slopes[0] + slopes[1])
     power = 2.0 * (slopes[0] * own[1] + slopes[1] * own[0])
     order = torch.from_numpy(np.argsort(pairs.angles, kind="stable"))
     both = [

@@ -360,6 +360,14 @@ def _convolved(values: Tensor, rows: int, kernel: Tensor) -> Tensor:
     return F.conv2d(padded, kernel.expand(1, 1, rows, -1) / rows)[:, 0]
 
 
+def varying(values: Tensor, kept: Tensor, axis: int) -> Tensor:
+    """``values`` in double precision without their mean along an axis over what is ``kept`` (1; 0:
+    left out, and 0 in the result)."""
+    v = values.double() * kept
+    number = kept.sum(axis, keepdim=True).clamp(min=1.0)
+    return (v - v.sum(axis, keepdim=True) / number) * kept
+
+
 class ConjugateRays:
     """Where the conjugate of a reading lies: view, row and column, all fractional."""
 

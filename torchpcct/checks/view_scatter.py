@@ -21,7 +21,7 @@ import math
 import numpy as np
 import torch
 
-from torchpcct.checks.ray_pairs import BLOCKS, RayPairs
+from torchpcct.checks.ray_pairs import BLOCKS, RayPairs, varying
 from torchpcct.checks.scan_test import UNKNOWN, ScanTest
 from torchpcct.geometry import view_step
 
@@ -60,21 +60,15 @@ def view_scatter_test(pairs: RayPairs) -> ScanTest:
         return UNKNOWN
     smooth, _, known = pairs.slopes("angles", _SLOPE_COLUMNS)
     kept = known[:, 0].double()
-    number = kept.sum(1, keepdim=True).clamp(min=1.0)
-
-    def varying(values: torch.Tensor) -> torch.Tensor:
-        """Without the mean over the columns, which a change of the exposure leaves."""
-        v = values[:, 0].double() * kept
-        return (v - v.sum(1, keepdim=True) / number) * kept
-
     columns = np.arange(kept.shape[1])
     apart = torch.from_numpy(columns % _GROUP < _GROUP - 1).double()
-    slopes = varying((smooth[0] + smooth[1]) / 2) * apart
+    # Without the mean over the columns, which a change of the exposure leaves.
+    slopes = varying((smooth[0] + smooth[1])[:, 0] / 2, kept, 1) * apart
     order = np.argsort(pairs.angles, kind="stable")
     starts = columns[::_GROUP]
     score, power = (
         np.add.reduceat(values.numpy(), starts, axis=1)[order]
-        for values in (varying(pairs.residue) * slopes, slopes * slopes)
+        for values in (varying(pairs.residue[:, 0], kept, 1) * slopes, slopes * slopes)
     )
     of_views = power.sum(1)
     if not (of_views > 0.0).any():
