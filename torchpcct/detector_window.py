@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.geometry import (
-    ConeBeam,
     Geometry,
     ParallelBeam,
     VolumeGrid,
@@ -241,16 +240,17 @@ def footprint(
     z = reach[:, None, None] + (shift[:, :1] if grid.ndim == 3 else 0.0)
     position, height = project_points(geometry, x, y, z)
     first_row, rows = 0, 1
-    if isinstance(geometry, ConeBeam):
+    if geometry.has_rows:
+        last = geometry.row_positions.size - 1
         row0 = (height.min() - geometry.row_positions[0]) / geometry.row_pitch - 0.5
         row1 = (height.max() - geometry.row_positions[0]) / geometry.row_pitch + 0.5
-        if row1 < 0.0 or row0 > geometry.rows - 1:
+        if row1 < 0.0 or row0 > last:
             raise ValueError(
                 f"the grid (z = {reach[0]:g} … {reach[1]:g} mm) lies above or below all "
-                f"{geometry.rows} rows in every view: move it along z"
+                f"{last + 1} rows in every view: move it along z"
             )
-        first_row = int(np.clip(math.floor(row0), 0, geometry.rows - 1))
-        rows = int(np.clip(math.ceil(row1), first_row, geometry.rows - 1)) - first_row + 1
+        first_row = int(np.clip(math.floor(row0), 0, last))
+        rows = int(np.clip(math.ceil(row1), first_row, last)) - first_row + 1
     index = (position - geometry.column_positions[0]) / geometry.column_pitch
     low, high = index.min(axis=1), index.max(axis=1)
     if low.min() < -0.5 - 1e-9 or high.max() > geometry.columns - 0.5 + 1e-9:

@@ -247,8 +247,8 @@ def larger_grid(grid: VolumeGrid, geometry: Geometry) -> VolumeGrid:
         edge = float(np.abs(geometry.column_positions).max()) + geometry.pitch / 2
     elif isinstance(geometry, (FanBeam, ConeBeam)):
         edge = geometry.sod * math.sin(min(float(np.abs(geometry.fan_angles).max()), math.pi / 2))
-        if isinstance(geometry, ConeBeam):
-            rows = float(np.abs(geometry.row_positions).max()) + geometry.pitch[0] / 2
+        if geometry.has_rows:
+            rows = float(np.abs(geometry.row_positions).max()) + geometry.row_pitch / 2
             top = rows * (geometry.sod + edge) / geometry.sdd
             bottom = -top
     elif isinstance(geometry, VectorGeometry):

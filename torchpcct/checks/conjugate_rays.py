@@ -53,7 +53,7 @@ from torchpcct.checks.ray_pairs import BLOCKS, RayPairs, product, unwrapped
 from torchpcct.checks.scan_test import UNKNOWN, ScanTest
 from torchpcct.checks.view_scatter import view_scatter_test
 from torchpcct.detector_window import DetectorWindow
-from torchpcct.geometry import ConeBeam, Geometry, view_step
+from torchpcct.geometry import Geometry, view_step
 from torchpcct.validate import checked
 
 __all__ = ["centre_test", "geometry_test"]
@@ -165,7 +165,7 @@ def geometry_test(
     ]
     # Of a whole cone beam the pairs are those of the plane of the source, which has no rows.
     stack: RayPairs | None = pairs
-    if window is None and isinstance(geometry, ConeBeam):
+    if window is None and geometry.has_rows:
         stack = RayPairs.stacked(lines, geometry, window, about)
     causes = [(stack, "roll"), (pairs, "scale"), (pairs, "step")]
     for of, name in causes:

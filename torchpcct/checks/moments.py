@@ -31,7 +31,7 @@ from torch import Tensor
 
 from torchpcct.checks.orbit_plane import THIN, lack_of_cells, orbit_plane
 from torchpcct.checks.scan_test import UNKNOWN, ScanTest, check_lines
-from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
+from torchpcct.geometry import ConeBeam, Geometry, view_step
 
 __all__ = ["moment_test"]
 
@@ -89,7 +89,7 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     check_lines(lines, g.shape)
     values = lines.detach().to("cpu", torch.float64)
     turned, parted, lacking = 0.0, 0.0, torch.zeros(g.views, g.columns, dtype=torch.float64)
-    if isinstance(g, ConeBeam):
+    if g.has_rows:
         plane = orbit_plane(values, g)
         # Of a dense disc thinner than a row the readings tell the shadow, not the attenuation.
         if plane is None or plane.part > THIN:
@@ -99,14 +99,15 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
         values, lacking, turned = plane.lines[:, 0], plane.lacking, plane.turned(closed=closed)
     order = np.argsort(g.angles, kind="stable")
     angles, p, lack = g.angles[order], values.numpy()[order], lacking.numpy()[order]
-    if isinstance(g, ParallelBeam):
-        theta, t = angles, np.asarray(g.column_positions)
+    t = g.ray_distances
+    if g.parallel:
+        theta = angles
     else:
         # Of a plane nothing lacks.
-        cone = isinstance(g, ConeBeam)
-        theta, p = _parallel(angles, g.fan_angles, np.concatenate([p, lack], 1) if cone else p)
-        p, lack = np.split(p, 2, axis=1) if cone else (p, np.zeros_like(p))
-        t = g.sod * np.sin(g.fan_angles)
+        theta, p = _parallel(
+            angles, g.fan_angles, np.concatenate([p, lack], 1) if g.has_rows else p
+        )
+        p, lack = np.split(p, 2, axis=1) if g.has_rows else (p, np.zeros_like(p))
     if theta.size < _DIRECTIONS or np.ptp(theta) + view_step(theta) < _LEAST_ARC:
         return UNKNOWN
     width = np.gradient(t)
@@ -120,11 +121,11 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
         (math.nan, math.inf) if mass <= 0 else _beyond(theta, moments[1] * (scale / mass), 1)
     )
     axial, axial_error, axial_tolerance = (
-        _axial(lines, g) if isinstance(g, ConeBeam) else (math.nan, math.inf, 0.0)
+        _axial(lines, g) if g.has_rows else (math.nan, math.inf, 0.0)
     )
     edge = _radius(t, p)
     # what ends near the plane is seen by rays on one side of the object alone
-    if isinstance(g, ConeBeam):
+    if g.has_rows:
         parted *= min(2.0 * edge / g.sod, 1.0)
     findings = []
     lacks = turned + _edges(theta, p, lack, p.sum(1))

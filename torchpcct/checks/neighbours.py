@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.checks.scan_test import UNKNOWN, ScanTest, check_lines
-from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam, view_step
+from torchpcct.geometry import Geometry, view_step
 from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.validate import checked
 
@@ -200,7 +200,7 @@ class _Views:
         self.step = view_step(angles)
         span = float(np.ptp(angles))
         self.closes = abs(span + self.step - 2.0 * math.pi) < 0.5 * self.step
-        reach = g.column_positions if isinstance(g, ParallelBeam) else g.sod * np.sin(g.fan_angles)
+        reach = g.ray_distances
         self.cell = float(np.median(np.abs(np.diff(reach))))
         highest = p.max((0, 1))
         body = highest > 0.05 * highest.max()
@@ -213,7 +213,7 @@ class _Views:
         if g.views < _FEWEST_VIEWS or g.columns < 2 * _LEAST_WINDOW:
             return None
         values = lines.detach().to("cpu")
-        if isinstance(g, ConeBeam):
+        if g.has_rows:
             groups = np.array_split(np.arange(g.rows), min(g.rows, _ROWS))
             values = torch.stack([values[:, int(k[0]) : int(k[-1]) + 1].mean(1) for k in groups], 1)
         else:
@@ -482,7 +482,7 @@ class _Views:
         values, slopes = self.means(width), self.means(width, slope=True)
         best: tuple[float, float, str] | None = None
         patterns: list[tuple[str, Sequence[Floats]]] = [("columns", slopes)]
-        if isinstance(self.g, ConeBeam) and values[0].shape[1] >= 3:
+        if self.g.has_rows and values[0].shape[1] >= 3:
             patterns.append(("rows", [np.gradient(v, axis=1) for v in values]))
         bends = [v[1:-1] - (v[2:] + v[:-2]) / 2.0 for v in values]
         for along, slope in patterns:

@@ -84,7 +84,7 @@ class PosedEngine:
             with torch.no_grad():
                 place = self.poses()[:, 0, : grid.ndim].flip(1).numpy()
             # Of a circle in the plane, whatever the source's height, as elsewhere.
-            circle = not isinstance(base, VectorGeometry)
+            circle = base.on_circle
             check_source(place[:, -2:] if circle else place, grid.slice if circle else grid)
 
     @property

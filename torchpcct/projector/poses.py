@@ -194,7 +194,7 @@ def _tensor(name: str, value: object, geometry: Geometry) -> Tensor:
 
 def _refuse(geometry: Geometry, given: Mapping[str, Tensor]) -> None:
     """Parameters that the geometry does not have (ValueError)."""
-    per_view = isinstance(geometry, VectorGeometry)
+    per_view = not geometry.on_circle
     missing = {
         "angles": "of a VectorGeometry are in its vectors" if per_view else "",
     }
