@@ -245,7 +245,7 @@ def _gain(
         noise = dispersion(signal, geometry.has_rows) if 0 < level < _FEW else 1.0
         if noise < _NO_PHOTONS:
             return max(noise, 1e-8 * level), "noise between neighbours"
-        if math.isnan(noise) and 0 < level < _NO_COUNTS:
+        if math.isnan(noise) and 0 < level < _NO_COUNTS and not _whole(signal):
             return 1e-6 * level, "assumed of transmissions"
         return 1.0, "assumed"
     if given is None:
@@ -313,6 +313,13 @@ def counted(
     if flux is not None:
         fields["flux"] = _flux(flux, geometry)
     return fields
+
+
+def _whole(signal: Tensor) -> bool:
+    """Whether readings are whole numbers, some of them above 1, as counts are and transmissions
+    are not."""
+    finite = signal[torch.isfinite(signal)]
+    return bool(torch.equal(finite, finite.round())) and bool((finite > 1.0).any())
 
 
 def _flux(flux: object, geometry: Geometry) -> Tensor:

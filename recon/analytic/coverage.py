@@ -287,11 +287,13 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid, motion: Floats | None = N
     unmeasured = _unmeasured_texts(lines, geometry, grid)
     found += [*columns, *unmeasured]
     sides = cut_off(lines, geometry, weights)
+    # What rays without light read is not what they pass: of that other tests say nothing.
+    lit = scan.logged or not without_light(scan)
     if any(sides):
         found.append(_cut_text(lines, sides))
-    elif len(found) == len(columns) + len(unmeasured) and not is_offset(geometry):
+    elif lit and len(found) == len(columns) + len(unmeasured) and not is_offset(geometry):
         found += moment_test(lines, geometry).findings
-    if scan.unit == "HU" and (scan.logged or not without_light(scan)):
+    if scan.unit == "HU" and lit:
         found += unit_warnings(lines, geometry, scan.linearisation.mu_ref)
     return found
 

@@ -34,6 +34,8 @@ _CUT_VIEWS = 0.05
 """In more than this fraction of the views."""
 _CUT_RANGES = 40
 """Ranges of the views over which the ends are averaged."""
+_CUT_FEWEST = 12
+"""The fewest of them, where there is more noise."""
 _LEFT_OUT = 0.1
 """Weight relative to the other end below which an end does not count."""
 _FEWEST_COLUMNS = 4
@@ -104,17 +106,21 @@ def _rises(end: Tensor, limit: float) -> bool:
     noise set aside.
 
     An object is cut off over ranges of views; noise is not: means over a fortieth of the turn are
-    compared, with a margin of three of their standard errors.
+    compared, or over as much more, up to a twelfth, as makes their noise a third of the limit, with
+    a margin of three of their standard errors. Logarithms of few photons have far outliers.
     """
     series = end.reshape(-1, 1, end.shape[-1]).double()
-    width = max(1, series.shape[-1] // _CUT_RANGES)
+    views = series.shape[-1]
+    width, sd = max(1, views // _CUT_RANGES), 0.0
+    if views > 2:
+        sd = float(series.diff(dim=-1).abs().median()) * MEDIAN_TO_SD / math.sqrt(2.0)
+        enough = math.ceil(min((3.0 * sd / limit) ** 2, views))
+        width = max(width, min(views // _CUT_FEWEST, enough))
     smooth = torch.nn.functional.avg_pool1d(series, width, 1)
-    margin = 0.0
-    if series.shape[-1] > 2:
-        margin = (
-            3.0 * float(series.diff(dim=-1).abs().median()) * MEDIAN_TO_SD / math.sqrt(2.0 * width)
-        )
-    return float((smooth > limit + margin).double().mean()) > _CUT_VIEWS
+    margin = 3.0 * sd / math.sqrt(width)
+    # One outlier lifts all means that it is in.
+    least = max(_CUT_VIEWS, 1.25 * width / smooth.shape[-1])
+    return float((smooth > limit + margin).double().mean()) > least
 
 
 def _room(geometry: Beam) -> tuple[int, int]:

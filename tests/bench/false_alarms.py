@@ -4,12 +4,16 @@ sizes right?
     python tests/bench/false_alarms.py [--n 500] [--first 0] [--kind cone] [--method fbp]
     [--readings 600000]
     python tests/bench/false_alarms.py --method pwls --n 100 --readings 20000
+    python tests/bench/false_alarms.py --photons 3 1000 [--n 500] [--readings 100000]
     python tests/bench/false_alarms.py --errors [--n 500] [--first 0] [--kind cone]
 
 Without ``--method`` only the checks run that :func:`recon.reconstruct` runs for every method; with
 it the whole reconstruction, and every warning of its report counts that accuses the scan; of PWLS
 and MBIR only scans whose object their grid can hold. Each alarm is printed with the
 seed of its scan; ``--seed N`` looks at one. The exit status is 1 if there is any.
+
+``--photons LOW HIGH`` draws the photons of a reading in air anew, of objects that stay as dense: of
+those the rays that leave none are rightly named.
 
 ``--errors`` describes each scan wrongly by a size drawn at random (the centre, the fan angles, the
 steps between views, a roll of the detector) and counts how often the error is found, is named, and
@@ -107,6 +111,17 @@ def of_the_scan(texts: list[str]) -> list[str]:
     return [text for text in texts if not any(part in text for part in own)]
 
 
+def dimmed(drawn: Drawn, photons: tuple[float, float]) -> Drawn:
+    """The same scan with photons a reading in air drawn anew, between two numbers."""
+    low, high = (math.log(bound) for bound in photons)
+    rng = np.random.default_rng([drawn.seed, 4])
+    return replace(
+        drawn,
+        photons=math.exp(rng.uniform(low, high)),
+        rightly=(*drawn.rightly, "photons a reading: how dark"),
+    )
+
+
 CAUSES = ("centre", "scale", "step", "roll")
 
 
@@ -186,6 +201,9 @@ def main() -> int:
     parser.add_argument("--seed", type=int, help="only this one")
     parser.add_argument("--kind", choices=KINDS, help="only such scans")
     parser.add_argument("--method", choices=("fbp", "pwls", "mbir"), help="reconstruct with it")
+    parser.add_argument(
+        "--photons", type=float, nargs=2, help="a reading in air, between two numbers"
+    )
     parser.add_argument("--readings", type=int, default=600_000, help="the most of a scan")
     parser.add_argument(
         "--errors",
@@ -206,6 +224,8 @@ def main() -> int:
     left_out = 0
     for seed in seeds:
         drawn = draw(seed, kind=options.kind, readings=options.readings)
+        if options.photons:
+            drawn = dimmed(drawn, tuple(options.photons))
         if options.method in ("pwls", "mbir") and not held_by_a_grid(drawn):
             left_out += 1
             continue
@@ -215,7 +235,7 @@ def main() -> int:
             alarmed[drawn.kind] += 1
             texts.update(text.split(":")[0][:60] for text in found)
             print(
-                f"{seed} | {drawn.text}",
+                f"{seed} | {drawn.text}; {drawn.photons:.0f} photons",
                 *(f"      {text[:170]}" for text in found),
                 sep="\n",
                 flush=True,

@@ -39,6 +39,14 @@ _NEIGHBOURS = 4
 """Cells on either side whose median a cell is compared with."""
 _FREQUENT = 0.005
 """Share of single lost readings from which zeros up to three wide are taken for lost, too."""
+_NEARLY_LOST = 0.2
+"""Share of a bright reading below which no noise of a bright reading comes (six photons of 30: one
+in 10⁷)."""
+_DETAILS = 0.05
+"""Readings that are nearly lost, over those that are, from which both are shadows of details that
+are narrower than a cell: what is lost reads 0."""
+_MOST_DIM = 200_000
+"""Readings that are looked at for it."""
 _SIGMAS = 8.0
 """Standard errors from which a deviation is none of chance."""
 _TOGETHER = 2
@@ -395,9 +403,9 @@ def _isolated(
     """Those of the zeros ``at`` ``(k, 3)`` whose non-zero neighbours in the row and the next rows
     are bright on both sides; and not both dim in the neighbouring rows or views: a detail as narrow
     as a cell goes on there."""
-    values = [[_around(n, at, side * dc) for dc in range(1, reach + 1)] for side in (-1, 1)]
-    stacked = np.ma.masked_less_equal(np.stack([np.concatenate(v) for v in values]), 0.0)
-    sides = np.ma.filled(np.ma.median(stacked, axis=1), 0.0)
+    sides = np.stack(
+        [_nearest([_around(n, at, side * dc) for dc in range(1, reach + 1)]) for side in (-1, 1)]
+    )
     good = (sides > light).all(0) & ~_dim_rows(n, at, light)
     onward = []
     for step in (-1, 1):
@@ -406,6 +414,22 @@ def _isolated(
         around = np.nan_to_num(_around(n, at, column, step))
         onward.append(around[len(around) // 2])
     return at[good & ~_dim(np.stack(onward), light)]
+
+
+def _of_details(
+    lost: NDArray[np.int64], n: NDArray[np.float32], first: NDArray[np.int64], light: float
+) -> bool:
+    """Whether zeros between bright readings are the noise of details that are narrower than a cell.
+
+    Their shadows then also leave a few photons in some readings between bright ones, where
+    readings that are lost leave none.
+    """
+    if not len(lost):
+        return False
+    at = np.flatnonzero((n > 0.0) & (n <= _NEARLY_LOST * light))
+    step = max(1, math.ceil(at.size / _MOST_DIM))
+    places = np.stack(np.unravel_index(at[::step], n.shape), 1)
+    return step * len(_isolated(n, places, first, light)) > _DETAILS * len(lost)
 
 
 def _dim_rows(n: NDArray[np.float32], at: NDArray[np.int64], light: float) -> NDArray[np.bool_]:
@@ -482,7 +506,7 @@ def _unshadowed(
             lost = np.unique(
                 np.concatenate([single, _isolated(n, at, first, light, reach=3)]), axis=0
             )
-            return lost, 0, 0
+            return (at[:0] if _of_details(lost, n, first, light) else lost), 0, 0
     # Cells of the detector, one after the other, each view by view: what follows without a break is
     # one run.
     cell = at[:, 2] + first[at[:, 0]]
@@ -517,7 +541,7 @@ def _unshadowed(
         p = at[place]
         drift = first[p[:, 0]] - first[np.clip(p[:, 0] + step, 0, len(n) - 1)]
         own, left, right = (
-            _middle(_around(n, p, d + drift, step))
+            _nearest([_around(n, p, d + drift, step)])
             for d in (0, -distance[0, middle], distance[1, middle])
         )
         inside = np.isfinite(own)
@@ -526,31 +550,43 @@ def _unshadowed(
         moved &= _company(n, p, first, step, _WIDTH + moving)
         tested |= inside
     good &= tested & ~moved
+    if _of_details(at[good[which]], n, first, light):
+        return at[:0], 0, 0
     lasting = good & (lengths >= _LASTING)
     cells = np.unique(np.stack([at[starts, 1], cell[starts]], 1)[lasting], axis=0)
     return at[good[which]], int(lengths[lasting].sum()), len(cells)
 
 
-def _middle(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Median of the bright ones of ``(k, places)`` at each place, 0 where there is none; NaN
-    stays."""
-    if len(values) == 1:
-        return np.asarray(values[0])
-    found = np.ma.filled(
-        np.ma.median(np.ma.masked_less_equal(np.nan_to_num(values), 0.0), axis=0), 0.0
-    )
-    return np.where(np.isnan(values[1]), np.nan, found)
+def _nearest(values: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """The first reading above 0 of the own row, where all are 0 the lowest one above 0 of the
+    next rows; 0 where there is none; NaN stays.
+
+    Rows differ where a face of the object lies between them: what the next ones read says little
+    of a row that has readings itself.
+
+    Args:
+        values: :func:`_around` at one place after the other.
+    """
+    stacked = np.stack(values)  # (places, rows, k)
+    middle = stacked.shape[1] // 2
+    live = np.where(stacked > 0, stacked, np.inf)
+    found = live.min((0, 1)) if stacked.shape[1] > 1 else np.full(stacked.shape[2], np.inf)
+    for own in reversed(live[:, middle]):
+        found = np.where(np.isfinite(own), own, found)
+    found = np.where(np.isfinite(found), found, 0.0).astype(stacked.dtype)
+    return np.where(np.isnan(stacked[0, middle]), np.nan, found)
 
 
 def _flank(
     n: NDArray[np.float32], at: NDArray[np.int64], side: int
 ) -> tuple[Ints, Floats, NDArray[np.float32]]:
-    """The first reading above 0 on one side of the zeros ``at``: how many columns away (0: none
-    near), it, the next."""
+    """The first reading above 0 in the row on one side of the zeros ``at``: how many columns away
+    (0: none near), it, the next."""
     distance = np.zeros(len(at), np.int64)
     near, far = np.zeros(len(at)), np.zeros(len(at))
     for d in range(1, _WIDTH + 3):
-        value = _middle(_around(n, at, side * d))
+        around = _around(n, at, side * d)
+        value = around[len(around) // 2]
         first = (distance == 0) & (value > 0)
         second = (distance > 0) & (far == 0) & (value > 0)
         near, far = np.where(first, value, near), np.where(second, value, far)

@@ -251,3 +251,35 @@ def test_a_detail_as_narrow_as_a_cell_is_no_lost_reading():
     n = np.random.default_rng(0).poisson(n).astype(np.float32)
     assert float((n == 0).sum()) > 3
     assert find_defects(torch.from_numpy(n), AIR).text == ""
+
+
+def test_a_dim_row_between_bright_ones_has_no_lost_readings():
+    """A disc seen edge on darkens one row to a few photons: zeros there are noise, and what was
+    lost in the bright rows is not."""
+    mean = np.full((VIEWS, 5, COLUMNS), 600.0)
+    mean[:, 2, 5:-5] = 4.0
+    n = torch.from_numpy(np.random.default_rng(3).poisson(mean).astype(np.float32))
+    assert float((n == 0).sum()) > 50
+    assert find_defects(n, torch.full((5, COLUMNS), 600.0)).text == ""
+    bad = torch.rand(n.shape, generator=torch.Generator().manual_seed(1)) < 0.002
+    bad &= torch.from_numpy(mean > 100.0)
+    bad[:, :, [0, -1]] = False
+    found = find_defects(n.masked_fill(bad, 0.0), torch.full((5, COLUMNS), 600.0)).mask
+    assert not (found & ~bad).any()
+    assert int((found & bad).sum()) > 0.9 * int(bad.sum())
+
+
+def test_zeros_of_details_narrower_than_a_cell_are_not_lost():
+    """A dense grain jumps by several columns from view to view, so that neither the next views nor
+    rows tell: its shadow of a few photons also leaves some."""
+    rng = np.random.default_rng(4)
+    mean = np.full((400, 1, COLUMNS), 90.0)
+    grain = rng.integers(10, 50, 400)
+    mean[np.arange(400), 0, grain] = rng.uniform(1.0, 6.0, 400)
+    air = torch.full((1, COLUMNS), 90.0)
+    n = torch.from_numpy(rng.poisson(mean).astype(np.float32))
+    assert float((n == 0).sum()) > 20
+    assert find_defects(n, air).text == ""
+    lost = torch.from_numpy(rng.poisson(np.full(mean.shape, 90.0)).astype(np.float32))
+    lost[np.arange(400), 0, grain] = 0.0
+    assert find_defects(lost, air).lost_readings == 400

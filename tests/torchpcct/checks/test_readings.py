@@ -59,8 +59,10 @@ def test_transmissions_are_no_counts():
             rtol=0.15,
             atol=0,
         )
-    low = counted(air=60.0)  # counts stay what they are
-    assert torch.equal(Scan.from_counts(low, FAN, air=60.0).counts, torch.from_numpy(low).float())
+    for air in (60.0, 1.5):  # counts stay what they are, however few
+        low = counted(air=air)
+        scan = Scan.from_counts(low, FAN, air=air)
+        assert torch.equal(scan.counts, torch.from_numpy(low).float())
 
 
 def test_the_gain_is_that_of_air_frames_however_uneven_the_field():
