@@ -245,6 +245,37 @@ def test_batches_of_any_size_and_layout(name, dtype):
     torch.testing.assert_close(torch.stack([A.T(one) for one in whole]), A.T(whole), **close)
 
 
+def test_volumes_of_a_batch_are_projected_together(monkeypatch):
+    A = _projector("cone_window")
+    passes = A._engine.cpu
+    most = passes.together(8)
+    sizes = []
+    for name in ("project", "backproject"):
+        kernel = getattr(cone_passes, name)
+        monkeypatch.setattr(
+            cone_passes, name, lambda *a, k=kernel: sizes.append(len(a[-1])) or k(*a)
+        )
+    A.T(A(_random((most + 2, *A.domain_shape))))
+    assert sizes == [most, 2] * 2
+    # Of large volumes one alone fits the cache.
+    monkeypatch.setattr(cone_passes, "TOGETHER_BYTES", 1)
+    assert passes.together(8) == 1
+
+
+def test_columns_without_readings_add_nothing_and_take_nothing():
+    A = _projector("cone_window")
+    y = _random(A.range_shape)
+    columns = y.shape[-1]
+    alone = torch.where(torch.arange(columns) == torch.arange(columns)[:, None, None, None], y, 0.0)
+    torch.testing.assert_close(A.T(alone).sum(0), A.T(y))
+    # NaN is a reading, and so are two that cancel.
+    bad = torch.zeros(A.range_shape, dtype=y.dtype)
+    bad[1, 2, columns // 2] = math.nan
+    assert bool(A.T(bad).isnan().any())
+    bad[1, 2, columns // 2], bad[1, 3, columns // 2] = 1.0, -1.0
+    assert bool(A.T(bad).any())
+
+
 @pytest.mark.parametrize("name", SOME)
 def test_calls_do_not_share_buffers(name):
     A = _projector(name)

@@ -8,8 +8,12 @@ rectangle, times the path through the slab, summed over slabs. In the plane the 
 out; along z they are differences of a running sum, read at the projected row edges by linear
 interpolation, which is the same overlap.
 
+Several volumes at a time share what depends on the geometry alone: their lines along z stand one
+after the other in one long line, which is read and written with one weight.
+
 Forward runs in parallel over views, the adjoint over slabs: no two threads write to one place and
-every sum has a fixed order, so that results do not depend on the number of threads.
+every sum has a fixed order, so that results depend neither on the number of threads nor on what
+else is in the batch.
 """
 
 from __future__ import annotations
@@ -235,22 +239,24 @@ def _plan(
 
 
 @_small
-def _add_rows(lanes, line, at, depth, z0, dz, row0, row_pitch, out):
-    """Add the row means of one layer (running sums ``line``) at the ray parameter ``depth`` to
-    ``out``."""
-    real = line.dtype.type
+def _add_rows(lanes, lines, at, depth, z0, dz, row0, row_pitch, out):
+    """Add the row means of one layer (running sums ``lines`` of all volumes) at the ray parameter
+    ``depth`` to ``out``, ``(batch, rows)``."""
+    real = lines.dtype.type
     step = depth * row_pitch / dz
     zeta = real((at[2] + depth * (row0 + at[7] - at[2]) - z0) / dz)
-    add_steps(
-        lanes, line, zeta, real(step), line.size - 8, line.size, real(1.0 / step), out, out.size
-    )
+    batch, rows = out.shape
+    knots = lines.size // batch
+    for n in range(batch):
+        line = lines[n * knots : (n + 1) * knots]
+        add_steps(lanes, line, zeta, real(step), knots - 8, knots, real(1.0 / step), out[n], rows)
 
 
 @_small
-def _give(at, centers, first, row0, row_pitch, sums, data):
-    """Sums over the slabs, ``(columns, ≥ rows)``, times the slant of each ray as readings ``(rows,
-    columns)``."""
-    rows, columns = data.shape
+def _give(at, centers, first, row0, row_pitch, sums, v, data):
+    """Sums over the slabs, ``(columns, batch, ≥ rows)``, times the slant of each ray as the
+    readings of view ``v`` of ``(batch, views, rows, columns)``."""
+    batch, _, rows, columns = data.shape
     for j in range(columns):
         a, b = centers[first + j, 0], centers[first + j, 1]
         dx, dy = a * at[3] + b * at[5], a * at[4] + b * at[6]
@@ -258,7 +264,8 @@ def _give(at, centers, first, row0, row_pitch, sums, data):
         for i in range(rows):
             rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
             slant = data.dtype.type(math.sqrt(1.0 + rise * rise / square))
-            data[i, j] = sums[j, i] * slant
+            for n in range(batch):
+                data[n, v, i, j] = sums[j, n, i] * slant
 
 
 @_kernel
@@ -283,18 +290,20 @@ def _project(
     layer,
     data,
 ):
-    """The views ``begin … end``; ``lines``: ``(ny * nx, knots)``, ``data``: ``(views, rows,
-    columns)``."""
-    knots = lines.shape[1]
-    _, rows, columns = data.shape
+    """The views ``begin … end``; ``lines``: ``(ny * nx, batch * knots)``, ``data``: ``(batch,
+    views, rows, columns)``."""
+    batch, _, rows, columns = data.shape
+    length = lines.shape[1]
+    knots = length // batch
     most = max(ny, nx)
     block = most
-    if lines.size * lines.itemsize > 2 * BLOCK_BYTES:
+    # Of one volume: where a block ends a sum does, and it must not depend on the batch.
+    if ny * nx * knots * lines.itemsize > 2 * BLOCK_BYTES:
         block = max(BLOCK_BYTES // (most * knots * lines.itemsize), 4)
     flat = lines.reshape(-1)
-    pair, slab = np.empty((2, knots), dtype=lines.dtype), np.empty(knots, dtype=lines.dtype)
+    pair, slab = np.empty((2, length), dtype=lines.dtype), np.empty(length, dtype=lines.dtype)
     # padded(rows)
-    sums = np.empty((VIEWS, columns, (rows + 7) // 8 * 8), dtype=lines.dtype)
+    sums = np.empty((VIEWS, columns, batch, (rows + 7) // 8 * 8), dtype=lines.dtype)
     for line in pair:
         _clear(line)
     layers, ends = np.empty(max(ny, nx), dtype=np.int64), np.empty(max(ny, nx), dtype=np.int64)
@@ -309,7 +318,7 @@ def _project(
                 for s in range(start[v], start[v + 1]):
                     axis = segments[s, 1]
                     slabs, width = (ny, nx) if axis == 0 else (nx, ny)
-                    across, along = (nx * knots, knots) if axis == 0 else (knots, nx * knots)
+                    across, along = (nx * length, length) if axis == 0 else (length, nx * length)
                     r1 = min(r0 + block, slabs)
                     if r1 <= r0:
                         continue
@@ -346,7 +355,7 @@ def _project(
                         for n in range(runs):
                             now, e1 = layers[n], ends[n]
                             if not layered:
-                                sum_lines(lanes, flat, offset, low, e0, e1, knots, slab)
+                                sum_lines(lanes, flat, offset, low, e0, e1, length, slab)
                                 depth = l0 + l1 * now
                                 _add_rows(lanes, slab, at, depth, z0, dz, row0, row_pitch, total[j])
                                 e0 = e1
@@ -359,7 +368,7 @@ def _project(
                                 high,
                                 e0,
                                 e1,
-                                knots,
+                                length,
                                 pair[now % 2],
                                 pair[(now + 1) % 2],
                             )
@@ -381,7 +390,7 @@ def _project(
                                     )
                                     _clear(line)
         for v in range(v0, v1):
-            _give(pose[v], centers, first[v], row0, row_pitch, sums[v - v0], data[v])
+            _give(pose[v], centers, first[v], row0, row_pitch, sums[v - v0], v, data)
 
 
 def project(
@@ -402,23 +411,23 @@ def project(
     layer,
     data,
 ):
-    """Cone-beam line integrals of one volume.
+    """Cone-beam line integrals of a batch of volumes.
 
     Args:
-        lines: ``(ny * nx, padded(nz) + 8)`` running sums of the volume along z: 0 first, the total
-            repeated.
+        lines: ``(ny * nx, batch * (padded(nz) + 8))`` running sums of the volumes along z: of each
+            0 first, the total repeated.
         pose, edges, centers, first: see ``rays.Rays``.
         segments, start: see ``rays.Segments``.
         lattice: ``(8,)`` slab positions, see ``_edge_line``.
         z0, dz: lower edge of the grid along z and its pitch (mm).
         row0, row_pitch: lower edge of the first row kept, and the pitch (mm on the detector).
         layer: spacing of the depth layers in the ray parameter, see ``layer_spacing``.
-        data: ``(views, rows, columns)`` output, overwritten.
+        data: ``(batch, views, rows, columns)`` output, overwritten.
     """
     lanes = (0,) * (32 // lines.dtype.itemsize)
     run(
         _project,
-        data.shape[0],
+        data.shape[1],
         lanes,
         lines,
         ny,
@@ -440,10 +449,10 @@ def project(
 
 
 @_kernel
-def _row_sums(begin, end, data, pose, centers, first, row0, row_pitch, view0, sums):
-    """Readings times their slant, summed along the rows: ``(views, columns, rows + 1)``, from
-    ``view0`` on."""
-    _, columns, edges = sums.shape
+def _row_sums(begin, end, data, pose, centers, first, row0, row_pitch, view0, sums, dark):
+    """Readings times their slant, summed along the rows: ``(views, columns, batch, rows + 1)``,
+    from ``view0`` on; and which ``(views, columns)`` hold nothing but zeros."""
+    _, columns, batch, edges = sums.shape
     for n in range(begin, end):
         v = view0 + n
         at = pose[v]
@@ -451,21 +460,31 @@ def _row_sums(begin, end, data, pose, centers, first, row0, row_pitch, view0, su
             a, b = centers[first[v] + j, 0], centers[first[v] + j, 1]
             dx, dy = a * at[3] + b * at[5], a * at[4] + b * at[6]
             square = dx * dx + dy * dy
-            sums[n, j, 0] = 0
+            nothing = True
+            for k in range(batch):
+                sums[n, j, k, 0] = 0
             for i in range(edges - 1):
                 rise = row0 + (i + 0.5) * row_pitch + at[7] - at[2]
                 slant = data.dtype.type(math.sqrt(1.0 + rise * rise / square))
-                sums[n, j, i + 1] = sums[n, j, i] + slant * data[v, i, j]
+                for k in range(batch):
+                    value = data[k, v, i, j]
+                    nothing &= value == 0
+                    sums[n, j, k, i + 1] = sums[n, j, k, i] + slant * value
+            dark[n, j] = nothing
 
 
 @_small
 def _layer_values(lanes, sums, at, depth, z0, dz, row0, row_pitch, values):
     """Transpose of ``_add_rows``: what each voxel of a line at ``depth`` collects from the
-    running row sums."""
+    running row sums ``(batch, rows + 1)``, for all volumes."""
     real = sums.dtype.type
     rho = ((z0 - at[2]) / depth - (row0 + at[7] - at[2])) / row_pitch
     pitch = dz / (depth * row_pitch)
-    set_steps(lanes, sums, real(rho), real(pitch), sums.size - 1, sums.size, values, values.size)
+    batch, edges = sums.shape
+    nz = values.size // batch
+    for n in range(batch):
+        line = values[n * nz : (n + 1) * nz]
+        set_steps(lanes, sums[n], real(rho), real(pitch), edges - 1, edges, line, nz)
 
 
 @_kernel
@@ -474,6 +493,7 @@ def _gather(
     end,
     lanes,
     sums,
+    dark,
     pose,
     edges,
     centers,
@@ -491,11 +511,11 @@ def _gather(
     by_row,
     by_column,
 ):
-    """Add a chunk of views to ``by_row``, ``(ny, nx, padded(nz))``, and ``by_column``, its
-    transpose, by blocks."""
+    """Add a chunk of views to ``by_row``, ``(ny, nx, batch * padded(nz))``, and ``by_column``,
+    its transpose, by blocks. What is ``dark`` adds nothing."""
     row_tasks = (by_row.shape[0] + SLAB_BLOCK - 1) // SLAB_BLOCK
-    nz = by_row.shape[2]
-    pair = np.empty((2, nz), dtype=sums.dtype)
+    length = by_row.shape[2]
+    pair = np.empty((2, length), dtype=sums.dtype)
     layers, ends = np.empty(SLAB_BLOCK, dtype=np.int64), np.empty(SLAB_BLOCK, dtype=np.int64)
     offset = np.empty(0, dtype=np.int64)
     low, high = np.empty(0, dtype=sums.dtype), np.empty(0, dtype=sums.dtype)
@@ -515,6 +535,8 @@ def _gather(
             v = segments[s, 0]
             at = pose[v]
             for j in range(segments[s, 2], segments[s, 2] + segments[s, 3]):
+                if dark[v - view0, j]:
+                    continue
                 p0, q0, p1, q1, l0, l1, path, _ = _cell(
                     at, edges, centers, first[v] + j, axis, lattice
                 )
@@ -535,8 +557,8 @@ def _gather(
                     r0,
                     r1,
                     width,
-                    width * nz,
-                    nz,
+                    width * length,
+                    length,
                     layers,
                     ends,
                     offset,
@@ -562,7 +584,7 @@ def _gather(
                             high,
                             e0,
                             e1,
-                            nz,
+                            length,
                             pair[now % 2],
                             pair[(now + 1) % 2],
                         )
@@ -570,7 +592,7 @@ def _gather(
                         _layer_values(
                             lanes, line, at, l0 + l1 * now, z0, dz, row0, row_pitch, pair[0]
                         )
-                        spread_line(lanes, flat, offset, low, e0, e1, nz, pair[0])
+                        spread_line(lanes, flat, offset, low, e0, e1, length, pair[0])
                     e0 = e1
 
 
@@ -589,30 +611,44 @@ def backproject(
     row_pitch,
     layer,
     chunk,
-    volume,
+    volumes,
 ):
     """The exact transpose of :func:`project`.
 
     Args:
-        data: ``(views, rows, columns)``.
+        data: ``(batch, views, rows, columns)``.
         chunk: views whose row sums are held at a time; the result does not depend on it.
-        volume: ``(nz, ny, nx)`` output, overwritten; dtype of ``data``.
+        volumes: ``(batch, nz, ny, nx)`` output, overwritten; dtype of ``data``.
     """
-    views, rows, columns = data.shape
-    nz, ny, nx = volume.shape
+    batch, views, rows, columns = data.shape
+    _, nz, ny, nx = volumes.shape
     lanes = (0,) * (32 // data.dtype.itemsize)
-    by_row = np.zeros((ny, nx, padded(nz)), dtype=data.dtype)
-    by_column = np.zeros((nx, ny, padded(nz)), dtype=data.dtype)
+    by_row = np.zeros((ny, nx, batch * padded(nz)), dtype=data.dtype)
+    by_column = np.zeros((nx, ny, batch * padded(nz)), dtype=data.dtype)
     tasks = sum(-(-slabs // SLAB_BLOCK) for slabs in (ny, nx))
     for before in range(0, views, chunk):
         after = min(before + chunk, views)
-        sums = np.empty((after - before, columns, rows + 1), dtype=data.dtype)
-        run(_row_sums, after - before, data, pose, centers, first, row0, row_pitch, before, sums)
+        sums = np.empty((after - before, columns, batch, rows + 1), dtype=data.dtype)
+        dark = np.empty((after - before, columns), dtype=np.bool_)
+        run(
+            _row_sums,
+            after - before,
+            data,
+            pose,
+            centers,
+            first,
+            row0,
+            row_pitch,
+            before,
+            sums,
+            dark,
+        )
         run(
             _gather,
             tasks,
             lanes,
             sums,
+            dark,
             pose,
             edges,
             centers,
@@ -631,7 +667,7 @@ def backproject(
             by_column,
         )
     by_row += by_column.transpose(1, 0, 2)
-    volume[...] = by_row[..., :nz].transpose(2, 0, 1)
+    volumes[...] = by_row.reshape(ny, nx, batch, -1)[..., :nz].transpose(2, 3, 0, 1)
 
 
 forget_outdated(__name__)

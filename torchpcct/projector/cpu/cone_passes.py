@@ -1,4 +1,4 @@
-"""The passes of the cone beam: volumes one by one, the adjoint in chunks of views."""
+"""The passes of the cone beam: a few volumes at a time, the adjoint in chunks of views."""
 
 from __future__ import annotations
 
@@ -12,6 +12,12 @@ from torchpcct.threads import get_num_threads
 ROW_SUMS_BYTES = 64 << 20
 """Row sums of the adjoint are made for chunks of views of about this size: large enough to keep all
 threads busy."""
+MOST_TOGETHER = 8
+"""Volumes of a batch that are projected together, at most: more gain nothing."""
+TOGETHER_BYTES = 12 << 20
+"""Of their voxels, at most: lines of more leave the second-level cache before they are read again.
+Against one by one, processor time of eight volumes of 32³ 0.65 (both passes), of four of 64³ 0.85,
+of two of 128³ 1.0 to 1.1."""
 
 
 class ConePasses:
@@ -24,10 +30,9 @@ class ConePasses:
         t, r = self.tables, self.tables.rays
         _, ny, nx = t.grid.shape
         y = np.empty((x.shape[0], *t.range_shape), dtype=x.dtype)
-        # One volume after the other: each stays in the cache, a batch of them would not.
-        for n in range(x.shape[0]):
+        for some in self._groups(len(x), x.itemsize):
             project(
-                running_sums(x[n]),
+                running_sums(x[some]),
                 ny,
                 nx,
                 t.pose,
@@ -39,16 +44,16 @@ class ConePasses:
                 t.lattice,
                 *t.heights,
                 t.layer,
-                y[n],
+                y[some],
             )
         return y
 
     def adjoint(self, y: NDArray) -> NDArray:
         t, r = self.tables, self.tables.rays
         x = np.empty((y.shape[0], *t.grid.shape), dtype=y.dtype)
-        for n in range(y.shape[0]):
+        for some in self._groups(len(y), y.itemsize):
             backproject(
-                y[n],
+                y[some],
                 t.pose,
                 r.edges,
                 r.centers,
@@ -58,43 +63,53 @@ class ConePasses:
                 t.lattice,
                 *t.heights,
                 t.layer,
-                self.views_at_once(y.itemsize),
-                x[n],
+                self.views_at_once(y.itemsize, len(y[some])),
+                x[some],
             )
         return x
 
+    def together(self, itemsize: int) -> int:
+        """How many volumes are projected together: they share what the geometry alone decides."""
+        nz, ny, nx = self.tables.grid.shape
+        fit = TOGETHER_BYTES // (itemsize * ny * nx * padded(nz))
+        return max(1, min(MOST_TOGETHER, fit))
+
+    def _groups(self, batch: int, itemsize: int) -> list[slice]:
+        most = self.together(itemsize)
+        return [slice(n, n + most) for n in range(0, batch, most)]
+
     def workspace(self, batch: int, itemsize: int) -> int:
-        """Bytes held besides input and output, the larger of the two directions; volumes pass
-        one by one."""
-        forward, adjoint, per_view = self.bytes(itemsize)
-        return max(forward, adjoint + per_view * self.views_at_once(itemsize))
+        """Bytes held besides input and output, the larger of the two directions."""
+        volumes = min(batch, self.together(itemsize))
+        r = self.tables.rays
+        table = 8 * (8 * r.views + 4 * len(self.tables.segments.table))
+        forward, adjoint, per_view = (volumes * part for part in self.bytes(itemsize))
+        return table + max(forward, adjoint + per_view * self.views_at_once(itemsize, volumes))
 
     def bytes(self, itemsize: int) -> tuple[int, int, int]:
-        """Working memory of the passes of one volume: forward, adjoint, adjoint per view held at
+        """Working memory of the passes for one volume: forward, adjoint, adjoint per view held at
         a time."""
-        r, table = (
-            self.tables.rays,
-            8 * (8 * self.tables.rays.views + 4 * len(self.tables.segments.table)),
-        )
+        r = self.tables.rays
         nz, ny, nx = self.tables.grid.shape
         sums = VIEWS * r.columns * padded(r.rows) * get_num_threads()
-        forward = ny * nx * (nz + 16) + sums
         return (
-            table + itemsize * forward,
-            table + itemsize * 2 * ny * nx * (nz + 8),
+            itemsize * (ny * nx * (nz + 16) + sums),
+            itemsize * 2 * ny * nx * (nz + 8),
             itemsize * r.columns * (r.rows + 1),
         )
 
-    def views_at_once(self, itemsize: int) -> int:
-        """Views whose row sums the adjoint holds at a time."""
-        return int(max(1, min(self.tables.rays.views, ROW_SUMS_BYTES // self.bytes(itemsize)[2])))
+    def views_at_once(self, itemsize: int, volumes: int = 1) -> int:
+        """Views whose row sums the adjoint of so many volumes holds at a time."""
+        fit = ROW_SUMS_BYTES // (volumes * self.bytes(itemsize)[2])
+        return int(max(1, min(self.tables.rays.views, fit)))
 
 
 def running_sums(x: NDArray[np.float32 | np.float64]) -> NDArray[np.float32 | np.float64]:
-    """``(nz, ny, nx)`` to the ``lines`` of ``cone_kernels.project``."""
-    nz, ny, nx = x.shape
-    lines = np.empty((ny * nx, padded(nz) + 8), dtype=x.dtype)
-    lines[:, 0] = 0
-    np.cumsum(x.reshape(nz, ny * nx).T, axis=-1, out=lines[:, 1 : nz + 1])
-    lines[:, nz + 1 :] = lines[:, nz, None]
-    return lines
+    """``(batch, nz, ny, nx)`` to the ``lines`` of ``cone_kernels.project``."""
+    batch, nz, ny, nx = x.shape
+    lines = np.empty((ny * nx, batch, padded(nz) + 8), dtype=x.dtype)
+    lines[..., 0] = 0
+    columns = x.reshape(batch, nz, ny * nx).transpose(2, 0, 1)
+    np.cumsum(columns, axis=-1, out=lines[..., 1 : nz + 1])
+    lines[..., nz + 1 :] = lines[..., nz, None]
+    return lines.reshape(ny * nx, -1)
