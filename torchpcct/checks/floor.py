@@ -1,5 +1,5 @@
-"""Do the readings stop at a lowest value? Negative readings that were set to 0, or left out, after
-the dark was taken off.
+"""Do the readings stop at a lowest value? Negative readings that were set to 0, or left out, or
+made positive, after the dark was taken off.
 
 Behind dense objects a detector with electronic noise reads as often below its dark level as above.
 Where such readings are set to 0 (or to any other lowest value: 1, a small transmission), those that
@@ -17,9 +17,12 @@ columns or along the views: readings are clipped if both have more zeros than ph
 
 Readings that were marked as dead for being low count as zeros, if there are few among bright ones.
 
+Absolute values of negative readings come once each: the density of readings, which is smooth where
+electronics add some noise, then goes on unchanged down to 0 and is nothing below. Where photons are
+counted the density ends at 0, too, but 0 itself comes again and again there.
+
 What this cannot show: noise of the electronics below the signal of a photon or a step of the
-digits, which clips little; counts so high that nothing was below 0, where nothing was changed; and
-what stands for the lower readings without coming again (their absolute values).
+digits, which clips little; and counts so high that nothing was below 0, where nothing was changed.
 """
 
 from __future__ import annotations
@@ -30,7 +33,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Floor", "clipped_floor"]
+__all__ = ["Floor", "clipped_floor", "folded_share"]
 
 Floats = NDArray[np.float64]
 
@@ -61,6 +64,24 @@ _SAMPLE = 200_000
 """Readings among which a value is looked for that comes again and again."""
 _LEAST = 200
 """Triples of a class, and of readings beside the lowest value, that say something."""
+
+_DARKEST = 0.05
+"""Share of the readings, the darkest ones, whose noise is looked at for absolute values."""
+_NEAR = 0.5
+"""Standard deviations above 0 in which their density is looked at."""
+_FEWEST_NEAR = 80
+"""Readings so near to 0 that tell; of a smooth density a fifth as many lie below 0."""
+_EVEN = (0.7, 1.35)
+"""Part of them in the lower half of that interval, over a half: of a density that goes on to 0."""
+_EXACT = 0.02
+"""Part of them that may read 0 itself: more are readings without a photon."""
+_STEPS = 4.0
+"""Values of the digits in that interval, at least: no photons that are counted reach 0 there."""
+_FEWEST_DARK = 2000
+"""The same in readings, at least."""
+_WHITE = -0.3
+"""Correlation of neighbouring second differences up to which they are noise (white: -2/3, somewhat
+more of those chosen for a dark mean)."""
 
 
 class Floor(NamedTuple):
@@ -101,6 +122,50 @@ def clipped_floor(counts: Floats, quantum: float) -> Floor:
     if masked.clipped and all(_in_the_dark(np.moveaxis(counts, k, -1)) for k in (0, 2)):
         return masked
     return found
+
+
+def folded_share(counts: Floats) -> float:
+    """Share of the readings that lie close above 0 while none lies below: negative ones were made
+    positive; 0 where that is not so, or cannot be told.
+
+    Args:
+        counts: ``(views, rows, columns)`` in any unit, NaN where dead.
+    """
+    known = counts[np.isfinite(counts)]
+    if known.size < _LEAST or float(known.min()) < 0.0:
+        return 0.0
+    sd = _noise_of_the_darkest(counts)
+    near = known[known < _NEAR * sd]
+    if near.size < max(_FEWEST_NEAR, 1e-4 * known.size):
+        return 0.0
+    lower = float((near < _NEAR * sd / 2.0).mean()) / 0.5
+    values = np.unique(near)
+    steps = values.size if values.size < 0.5 * near.size else math.inf
+    if not _EVEN[0] < lower < _EVEN[1] or steps < _STEPS:
+        return 0.0
+    # Of whole steps 0 is one, as likely as half of another one.
+    exact = float((near == 0.0).mean())
+    return 0.0 if exact > max(_EXACT, 1.0 / steps) else near.size / known.size
+
+
+def _noise_of_the_darkest(counts: Floats) -> float:
+    """Standard deviation of the darkest readings about their neighbours in the row; 0 where what
+    changes between them is no noise."""
+    second = counts[..., 2:] - 2.0 * counts[..., 1:-1] + counts[..., :-2]
+    mean = (counts[..., 2:] + counts[..., 1:-1] + counts[..., :-2]) / 3.0
+    known = np.isfinite(second)
+    if not known.any():
+        return 0.0
+    share = min(max(_DARKEST, _FEWEST_DARK / known.sum()), 1.0)
+    dark = known & (mean <= np.quantile(mean[known], share))
+    both = dark[..., 1:] & dark[..., :-1]
+    if both.sum() < _LEAST:
+        return 0.0
+    a, b = second[..., 1:][both], second[..., :-1][both]
+    if (a * b).sum() > _WHITE * math.sqrt(float((a * a).sum() * (b * b).sum())):
+        return 0.0
+    quartiles = float(np.subtract(*np.quantile(second[dark], (0.75, 0.25))))
+    return quartiles / 1.349 / math.sqrt(6.0)
 
 
 def _repeated(counts: Floats, lowest: float) -> float:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpcct.checks.floor import clipped_floor
+from torchpcct.checks.floor import clipped_floor, folded_share
 from torchpcct.readings import DIM, FEWEST, MEDIAN_TO_SD, smoothed
 from torchpcct.scan import Scan
 
@@ -66,6 +66,11 @@ _LEAST_COLUMNS = 24
 """Columns of a detector that is tested."""
 _LEAST_VIEWS = 16
 """Views of a scan that is tested."""
+_AS_BEFORE = (
+    "give the readings as they were before, negative ones too, with dark= or electronic_noise=, or, "
+    "where those are lost, mask the whole shadow (dead=) or scan at a higher exposure"
+)
+"""What to do about negative readings that are none any more."""
 _MOST = 4_000_000
 """Readings that are looked at; more only cost time."""
 
@@ -255,19 +260,25 @@ def _mean(values: NDArray[np.float64], axes: tuple[int, ...]) -> NDArray[np.floa
 
 
 def _at_the_floor(counts: NDArray[np.float64], quantum: float) -> list[str]:
-    """Whether readings were clipped at their lowest value."""
+    """Whether readings were clipped at their lowest value, or negative ones made positive."""
     floor = clipped_floor(counts, quantum)
     if not floor.clipped:
-        return []
+        folded = folded_share(counts)
+        if folded == 0.0:
+            return []
+        return [
+            f"{100 * folded:.2g} % of the readings lie closer above 0 than half of their noise, "
+            "and none below: negative ones, after the dark was taken off, were made positive "
+            "(absolute values?), the darkest rays read too bright and what they pass too low; "
+            f"{_AS_BEFORE}"
+        ]
     where = "are marked as dead" if math.isnan(floor.value) else f"read {floor.value:.3g}"
     how = "left out" if math.isnan(floor.value) else "clipped there"
     return [
         f"{100 * floor.share:.2g} % of the readings {where}, {100 * floor.excess:.2g} % more than "
         f"photons leave dark beside readings of several photons: lower ones were {how} (negative "
         "ones, after the dark was taken off?), the darkest rays read too bright and what they pass "
-        "too low; give the readings as they were before, negative ones too, with dark= or "
-        "electronic_noise=, or, where those are lost, mask the whole shadow (dead=) or scan at a "
-        "higher exposure"
+        f"too low; {_AS_BEFORE}"
     ]
 
 

@@ -8,7 +8,7 @@ from analytic import Ellipsoid, line_integrals
 
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, full_turn
 from torchpcct.checks.defects import repair_defects
-from torchpcct.checks.floor import _chance, clipped_floor
+from torchpcct.checks.floor import _chance, clipped_floor, folded_share
 from torchpcct.checks.readings import reading_warnings
 
 MU = 0.02
@@ -132,3 +132,54 @@ def test_dead_readings_and_windows_do_not_disturb():
     lost = np.random.default_rng(5).random(counts.shape) < 0.03  # at random, not the dark ones
     for n in (read(air=1e3), read(air=30.0)):
         assert not clipped_floor(np.where(lost, np.nan, n[:, None]), 1.0).clipped
+
+
+FOLDED = "made positive"
+
+
+def of_negative(readings, beam="fan", air=100.0, **description):
+    scan = Scan.from_counts(readings, BEAMS[beam], air=air, mu_water=MU, **description)
+    return [text for text in reading_warnings(repair_defects(scan)[0]) if FOLDED in text]
+
+
+@pytest.mark.parametrize(("air", "noise"), [(100.0, 2.0), (100.0, 7.0), (1e3, 30.0), (1e4, 200.0)])
+@pytest.mark.parametrize("beam", ["parallel", "fan"])
+def test_absolute_values_of_negative_readings_are_named(beam, air, noise):
+    y = read(beam, air, noise)
+    for folded, description in (
+        (np.abs(y), {}),
+        (np.abs(y), {"electronic_noise": noise}),
+        (np.abs(np.round(12.0 * y)), {"gain": 12.0, "air": 12.0 * air}),
+    ):
+        (text,) = of_negative(folded, beam, **{"air": air, **description})
+        # Half of a standard deviation of what is left of the noise.
+        assert 0.2 < float(text.split(" %")[0]) / (100.0 * (y <= 0).mean()) < 4.0
+    assert of_negative(y, beam, air, electronic_noise=noise) == []
+
+
+def test_logarithms_of_absolute_values_are_named():
+    p = np.log(1e3 / np.abs(read(air=1e3, noise=30.0)))
+    scan = Scan.from_line_integrals(p, BEAMS["fan"], mu_water=MU)
+    assert any(FOLDED in text for text in reading_warnings(scan))
+
+
+@pytest.mark.parametrize("air", [3.0, 10.0, 30.0, 100.0, 300.0])
+def test_photons_end_at_0_without_absolute_values(air):
+    """Counts, each cell over its gain, means of frames, pulses of different energies, what was
+    interpolated, logarithms with half a photon added."""
+    rng = np.random.default_rng(7)
+    n = read(air=air)
+    gains = rng.uniform(0.8, 1.2, n.shape[-1])
+    blurred = 0.3 * np.roll(n * gains, 1, -1) + 0.7 * n * gains
+    for values in (
+        n,
+        n * gains,
+        rng.poisson(16 * air * SHONE["fan"]) / 16.0,
+        rng.gamma(np.maximum(9.0 * n, 1e-9)),
+        blurred,
+        0.4 * np.roll(blurred, 1, 0) + 0.6 * blurred,
+        (n + 0.5) * gains,
+        np.maximum(n, 0.5) * gains,
+        SHONE["fan"] ** 6,  # no noise
+    ):
+        assert folded_share(values[:, None].astype(float)) == 0.0
