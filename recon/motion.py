@@ -19,15 +19,21 @@ model averaging, Hoeting et al. 1999, Stat. Sci. 14:382). The one likeliest prio
 for certain and state errors along the rays that are several times too small. A constant
 displacement is another volume; the path's mean is zero.
 
+**A jump** is no smooth path, but one that differs along the rays often explains its readings, and
+is then wrong by as much as the jump. Paths that may jump at one view, too, are compared with the
+smooth ones by their marginal likelihood: a smooth path that does what a jump does is large and
+bent, and therefore less likely.
+
 **Voxels** of the working grid are no larger than a detector cell as it is seen at the inset. What
 larger ones cannot show looks like motion along the rays, and is more than the noise.
 """
 
 from __future__ import annotations
 
+import copy
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from itertools import product
@@ -58,7 +64,7 @@ from torchpcct.vector_geometry import check_motion
 if TYPE_CHECKING:
     from torchpcct.typing import JsonObject
 
-__all__ = ["InsetMotion", "estimate_motion", "path_of"]
+__all__ = ["InsetMotion", "Jump", "estimate_motion", "path_of"]
 
 _LOG = logging.getLogger(__name__)
 Floats = NDArray[np.float64]
@@ -100,6 +106,20 @@ _WIDTHS = {1.0: 1, 0.3: 12, 0.1: 24}
 of the larger one are tried: a line is an ellipse of a tenth."""
 _LEAST_MM = 0.003
 """Of the prior's scale along any direction."""
+_JUMPS_MM = (0.1, 0.3, 0.9)
+"""Of the prior's jump along each axis, standard deviations."""
+_JUMP_VIEWS = 8
+"""Averaged views from one place where a jump is looked for to the next; about the best one it is
+looked for at every view."""
+_JUMP_REACH = 2
+"""Averaged views by which a jump may be found elsewhere once the path has it."""
+_JUMP_TIMES = 3
+"""Places of a jump that the path is followed with, at most."""
+_JUMP_EVIDENCE = 8.0
+"""Logarithm of the marginal likelihood's ratio to the smooth path, from which on a jump is
+believed. Of eleven smooth motions it is -6 to -2, of six jumps 30 to 900."""
+_NEGLIGIBLE = 1e-7
+"""Share of the whole below which a prior does nothing."""
 _SMOOTH_VOXELS = 1.0
 """Standard deviation by which the volume is smoothed before its effects are computed."""
 _NOISES = 3.0
@@ -125,6 +145,39 @@ _CHANCE = 1.05
 
 
 @dataclass(frozen=True)
+class Jump:
+    """A displacement at once.
+
+    Attributes:
+        view: first view of the scan after it.
+        mm: ``(3,)`` z, y, x.
+        errors: ``(3,)`` standard errors.
+    """
+
+    view: int
+    mm: Floats
+    errors: Floats
+
+    @property
+    def length(self) -> float:
+        """Of the displacement, mm."""
+        return float(np.linalg.norm(self.mm))
+
+    @property
+    def error(self) -> float:
+        """Standard error of :attr:`length`."""
+        return float(np.linalg.norm(self.mm * self.errors)) / max(self.length, 1e-12)
+
+    def report(self) -> JsonObject:
+        """All numbers, for JSON."""
+        return {
+            "view": self.view,
+            "mm": np.round(self.mm, 4).tolist(),
+            "errors_mm": np.round(self.errors, 4).tolist(),
+        }
+
+
+@dataclass(frozen=True)
 class InsetMotion:
     """Result of :func:`estimate_motion`.
 
@@ -139,6 +192,7 @@ class InsetMotion:
             and along ``path``.
         steps: iterations done.
         warnings: what restrains trust in the result.
+        jump: that the path has, if the readings hold one; None: the path is smooth.
     """
 
     path: Floats
@@ -149,6 +203,7 @@ class InsetMotion:
     misfit: tuple[float, float]
     steps: int
     warnings: list[str] = field(default_factory=list)
+    jump: Jump | None = None
 
     def report(self) -> JsonObject:
         """All numbers, for JSON."""
@@ -162,6 +217,7 @@ class InsetMotion:
             "errors_mm": np.round(self.errors, 4).tolist()
             if np.isfinite(self.errors).all()
             else None,
+            "jump": None if self.jump is None else self.jump.report(),
         }
 
 
@@ -170,7 +226,10 @@ class _Problem:
 
     Attributes:
         basis: ``(views, k)`` of mean zero, of the scan's views; independent standard normal
-            coefficients are the prior of a path of 1 mm², mean square, along one axis.
+            coefficients are the prior of a path of 1 mm², mean square, along one axis. With a jump
+            one column more: 1 mm from a view on.
+        smooth: columns of ``basis`` without the jump's.
+        jump: first averaged view after the jump; None: no jump.
     """
 
     def __init__(self, scan: Scan, grid: VolumeGrid, rate: float | None) -> None:
@@ -190,6 +249,8 @@ class _Problem:
         self._averaging = _averages(groups, geometry.views)
         self.geometry = replace(geometry, angles=self._averaging @ angles)
         self.basis = _basis((angles - angles[0]) / (angles[-1] - angles[0]), rate)
+        self.smooth = self.basis.shape[1]
+        self.jump: int | None = None
         self._few = self._averaging @ self.basis
         self.window = self._window()
         window = scan.window
@@ -295,7 +356,7 @@ class _Problem:
         rest, quiet = (misfit(f, self.weights, 2) for f in found)
         return rest, quiet
 
-    def at(self, coefficients: Floats, effects: Tensor | None = None) -> tuple[Normal, Tensor]:
+    def at(self, coefficients: Floats, effects: _Effects | None = None) -> tuple[Normal, _Effects]:
         """Equations for what is to be added to the coefficients, axis by axis, and the effects;
         ``effects``: of another state nearby, which are not computed again."""
         motion = np.ascontiguousarray(self._few @ coefficients)
@@ -311,10 +372,81 @@ class _Problem:
                 tangents[axis, :, :2, 2 - axis] = -1.0
             # Of a smoother volume: its noise must not be taken for edges that move.
             soft = self._volume(self._plan("soft", motion), self.lines)
-            moved = posed.derivatives(_quiet(soft), tangents)
-            over_time = torch.from_numpy(self._few.T.astype(np.float32))[None, :, :, None, None]
-            effects = smoothed_cells(left((moved[:, None] * over_time).flatten(0, 1)), 2)
-        return normal_equations(effects, rest, self.weights, 2), effects
+            effects = _Effects(posed.derivatives(_quiet(soft), tangents), left)
+            effects = replace(effects, own=effects.over_time(self._few))
+        effects = replace(effects, rest=rest)
+        return normal_equations(effects.own.flatten(0, 1), rest, self.weights, 2), effects
+
+    def first_view(self, view: int) -> int:
+        """First view of the scan in an averaged view."""
+        return int(np.argmax(self._averaging[view] > 0.0))
+
+    def late(self, view: int) -> Floats:
+        """``(views,)`` of mean zero: a displacement of 1 mm from an averaged view on."""
+        found = self._averaging[view:].any(0).astype(np.float64)
+        return found - found.mean()
+
+    def with_jump(self, view: int) -> _Problem:
+        """The same readings, of paths that may jump at an averaged view, too."""
+        found = copy.copy(self)
+        found.jump = view
+        found.basis = np.column_stack([self.basis[:, : self.smooth], self.late(view)])
+        found._few = self._averaging @ found.basis
+        return found
+
+    def gains(self, views: Sequence[int], at: Floats, effects: _Effects) -> Floats:
+        """By how much the evidence of paths that jump at one of some averaged views is above that
+        of the paths of this problem.
+
+        Args:
+            views: the averaged views.
+            at: coefficients of a path of this problem.
+            effects: there.
+        """
+        k, smooth = self.basis.shape[1], [*range(self.smooth)]
+        given = self._averaging @ np.stack([self.late(view) for view in views], 1)
+        own = torch.cat([effects.own, effects.over_time(given)], 1)
+        every = normal_equations(own.flatten(0, 1), effects.rest, self.weights, 2)
+        several = np.vstack([at, np.zeros((1, 3))])
+        found = []
+        for m in range(len(views)):
+            with_one = _part(every, [*range(k), k + m], own.shape[1])
+            likelihood = _likelihood(with_one, several, self.inflation)
+            jumping = _evidence(likelihood, [*smooth, k], jumps=True, round_only=True)
+            now = _evidence(likelihood, [*range(k)], jumps=k > self.smooth, round_only=True)
+            found.append(jumping - now)
+        return np.array(found)
+
+
+@dataclass(frozen=True)
+class _Effects:
+    """What the path does to the readings, near one path.
+
+    Attributes:
+        moved: ``(3, views, rows, columns)``, by a displacement of 1 mm in every view.
+        left: what volumes along the path leave of readings.
+        own: ``(3, k, views, rows, columns)``, what they leave of the coefficients' effects,
+            smoothed.
+        rest: ``(1, views, rows, columns)``, and of the readings.
+    """
+
+    moved: Tensor
+    left: Callable[[Tensor], Tensor]
+    own: Tensor = field(default_factory=lambda: torch.empty(0))
+    rest: Tensor = field(default_factory=lambda: torch.empty(0))
+
+    def over_time(self, paths: Floats) -> Tensor:
+        """:attr:`own` of other paths ``(views, m)`` along each axis."""
+        given = torch.from_numpy(np.ascontiguousarray(paths.T, dtype=np.float32))
+        effects = self.moved[:, None] * given[None, :, :, None, None]
+        return smoothed_cells(self.left(effects.flatten(0, 1)), 2).unflatten(0, (3, len(given)))
+
+
+def _part(found: Normal, columns: Sequence[int], of: int) -> Normal:
+    """The equations of some columns of a path's basis, of all ``of``."""
+    at = np.concatenate([np.add(axis * of, columns) for axis in range(3)])
+    information, spread = (m[np.ix_(at, at)] for m in (found.information, found.spread))
+    return Normal(information, found.pull[at], spread, found.misfit)
 
 
 def _quiet(volume: Tensor) -> Tensor:
@@ -408,50 +540,84 @@ class _Belief:
     Attributes:
         mean, covariance: of the coefficients.
         evidence: logarithm of the marginal likelihood over that of rest.
+        gain: of that by the jump; 0 without one.
     """
 
     mean: Floats
     covariance: Floats
     evidence: float
+    gain: float = 0.0
 
 
-def _believed(found: Normal, at: Floats, inflation: float) -> _Belief:
+def _believed(found: Normal, at: Floats, inflation: float, jumps: bool = False) -> _Belief:
     """The coefficients under normal priors of all sizes and directions, weighted by how likely the
     readings are under each; the covariance holds how far their means differ.
 
     Args:
         found: equations about ``at``.
         at: ``(k, 3)``.
+        jumps: whether the last of the k is a jump.
     """
     k = len(at)
+    precision, pull = _likelihood(found, at, inflation)
+    prior, shares = _priors(k - jumps, jumps)
+    means, evidence = _weighed(precision, pull, prior, shares)
+    top = float(evidence.max())
+    weights = np.exp(evidence - top)
+    total = float(weights.sum())
+    likely = weights > _NEGLIGIBLE * total
+    weights, means = weights[likely] / weights[likely].sum(), means[likely]
+    covariances = np.linalg.solve(np.eye(3 * k) + prior[likely] @ precision, prior[likely])
+    mean = weights @ means
+    apart = means - mean
+    covariance = np.einsum("m,mij->ij", weights, covariances) + (apart.T * weights) @ apart
+    whole = top + math.log(total)
+    gain = whole - _evidence((precision, pull), range(k - 1)) if jumps else 0.0
+    return _Belief(mean.reshape(3, k).T, 0.5 * (covariance + covariance.T), whole, gain)
+
+
+def _likelihood(found: Normal, at: Floats, inflation: float) -> tuple[Floats, Floats]:
+    """Precision and pull of the coefficients by the readings alone, about zero."""
     h = found.information
     unit = np.sqrt(np.maximum(np.diag(h), 1e-300))
     spread = found.spread * inflation / np.outer(unit, unit)
     inverse = np.linalg.pinv(spread, rcond=1e-6, hermitian=True) / np.outer(unit, unit)
-    precision = h @ inverse @ h
-    pull = h @ inverse @ (found.pull + h @ at.T.ravel())
-    between, shares = _priors()
-    prior = np.einsum("mij,kl->mikjl", between, np.eye(k)).reshape(-1, 3 * k, 3 * k)
-    matrix = np.eye(3 * k) + prior @ precision
-    covariances = np.linalg.solve(matrix, prior)
-    means = covariances @ pull
+    return h @ inverse @ h, h @ inverse @ (found.pull + h @ at.T.ravel())
+
+
+def _weighed(
+    precision: Floats, pull: Floats, prior: Floats, shares: Floats
+) -> tuple[Floats, Floats]:
+    """Means ``(n, 3 k)`` under each prior, and logarithms of how likely the readings are under it
+    over rest, times its share."""
+    matrix = np.eye(len(pull)) + prior @ precision
+    means = np.asarray(np.linalg.solve(matrix, (prior @ pull)[..., None])[..., 0], np.float64)
     evidence = 0.5 * means @ pull - 0.5 * np.linalg.slogdet(matrix)[1] + np.log(shares)
-    top = float(evidence.max())
-    weights = np.exp(evidence - top)
-    total = float(weights.sum())
-    weights /= total
-    mean = weights @ means
-    apart = means - mean
-    covariance = np.einsum("m,mij->ij", weights, covariances) + (apart.T * weights) @ apart
-    return _Belief(mean.reshape(3, k).T, 0.5 * (covariance + covariance.T), top + math.log(total))
+    return means, np.asarray(evidence, np.float64)
+
+
+def _evidence(
+    likelihood: tuple[Floats, Floats],
+    columns: Sequence[int],
+    jumps: bool = False,
+    round_only: bool = False,
+) -> float:
+    """Logarithm of the marginal likelihood over that of rest, of paths of some columns only; for
+    ``jumps`` and ``round_only`` see :func:`_priors`."""
+    precision, pull = likelihood
+    at = np.arange(len(pull)).reshape(3, -1)[:, columns].ravel()
+    priors = _priors(len(columns) - jumps, jumps, round_only)
+    found = _weighed(precision[np.ix_(at, at)], pull[at], *priors)[1]
+    return float(np.logaddexp.reduce(found))
 
 
 @cache
-def _priors() -> tuple[Floats, Floats]:
-    """Covariances ``(n, 3, 3)`` mm² of the displacements between z, y and x, and how likely each is
-    before any reading."""
+def _priors(k: int, jumps: bool, round_only: bool = False) -> tuple[Floats, Floats]:
+    """Covariances ``(n, 3 k, 3 k)`` of the coefficients of ``k`` columns, axis by axis, and how
+    likely each is before any reading; ``jumps``: of one column more. ``round_only``: of no
+    direction in the plane."""
     found, shares = [], []
-    for width, ways in _WIDTHS.items():
+    for width, ways in ({1.0: 1} if round_only else _WIDTHS).items():
         for way in math.pi * np.arange(ways) / ways:
             along = np.array([math.sin(way), math.cos(way)])
             across = np.array([math.cos(way), -math.sin(way)])
@@ -462,7 +628,15 @@ def _priors() -> tuple[Floats, Floats]:
                 one[1:, 1:] = size**2 * shape + _LEAST_MM**2 * np.eye(2)
                 found.append(one)
                 shares.append(1.0 / ways)
-    return np.stack(found), np.array(shares) / sum(shares)
+    between, likely = np.stack(found), np.array(shares) / sum(shares)
+    if not jumps:
+        return np.einsum("mij,kl->mikjl", between, np.eye(k)).reshape(-1, 3 * k, 3 * k), likely
+    whole = np.zeros((len(_JUMPS_MM), len(between), 3, k + 1, 3, k + 1))
+    whole[:, :, :, :k, :, :k] = np.einsum("mij,kl->mikjl", between, np.eye(k))
+    for size, one in zip(_JUMPS_MM, whole, strict=True):
+        one[:, :, k, :, k] = size**2 * np.eye(3)
+    n = 3 * (k + 1)
+    return whole.reshape(-1, n, n), np.tile(likely, len(_JUMPS_MM)) / len(_JUMPS_MM)
 
 
 @checked
@@ -480,15 +654,15 @@ def estimate_motion(
         scan: counting, one channel, of a cone beam on a circle, acquired with ``region``: the
             surround is known, all else lies in the region at all times.
         grid: ``(z, y, x)`` grid of the inset; the working grid covers the scan's region.
-        heart_rate: beats a minute; the path then repeats itself with every beat. None: any smooth
-            path, a cubic spline.
+        heart_rate: beats a minute; the path then repeats itself with every beat and does not jump.
+            None: any smooth path, a cubic spline, with one jump if the readings hold one.
         rotation_s: time of one turn in s, for ``heart_rate``.
         progress: called with the finished fraction, 0…1.
 
     Returns:
         The path with standard errors, and whether the readings hold it; if not, the path is zero
-        and ``warnings`` say so. The errors are those of noise, of a model of voxels and of what no
-        view sees, under the prior.
+        and ``warnings`` say so. A jump is said there, too. The errors are those of noise, of a
+        model of voxels and of what no view sees, under the prior.
 
     Raises:
         ValueError: an unknown surround, energy bins, another geometry, fewer than 48 views, a path
@@ -498,44 +672,33 @@ def estimate_motion(
     _require_inset(scan)
     problem = _Problem(scan, grid, _beats(scan, heart_rate, rotation_s))
     tell = progress or (lambda _: None)
-    at = problem.start()
     rest, quiet = problem.misfits()
-    effects: Tensor | None = None
-    for step in range(1, _STEPS + 1):
-        found, effects = problem.at(at, effects)
-        if not np.diag(found.information).max() > 0.0:
-            return _none(problem, rest, step)
-        belief = _believed(found, at, problem.inflation)
-        change = problem.path(belief.mean - at)
-        largest = float(np.abs(change).max())
-        errors = problem.errors(belief.covariance)
-        at = at + (belief.mean - at) / max(1.0, largest / _LARGEST_STEP_MM)
-        farthest = float(np.abs(problem.path(at)).max())
-        if farthest > _REACH_MM:
-            raise ValueError(
-                f"the path that fits leads {farthest:.2g} mm away from its mean, more than the "
-                f"{_REACH_MM:g} mm that are looked for: the inset moves too far in this scan, or "
-                "what it holds is too faint for its motion to be found"
-            )
-        effects = effects if largest < _NEAR_MM else None
-        tell(step / (_STEPS + 1))
-        if _rms(change) < _SETTLED * _rms(errors):
-            break
-    path = problem.path(at)
+    found = _followed(problem, problem.start(), tell)
+    if found is None:
+        return _none(problem, rest)
+    if heart_rate is None and found.belief.evidence >= _LEAST_EVIDENCE:
+        found = _with_jump(found)
+    path, errors, belief = found.path, found.errors, found.belief
     size, error = _rms(path), _rms(errors)
     held = belief.evidence >= _LEAST_EVIDENCE and size > max(_FLOOR_MM, error)
-    after = problem.at(at, effects)[0].misfit if held else rest
+    after = found.problem.at(found.coefficients, found.effects)[0].misfit if held else rest
+    jump = found.jump if held else None
     texts = []
     if not held:
         texts.append(
             "the readings hold no motion of the inset: the path that fits best has "
             f"{size:.2g} ± {error:.2g} mm, root mean square; none is applied"
         )
+    if jump is not None:
+        texts.append(
+            f"the inset jumps by {jump.length:.2g} ± {jump.error:.2g} mm at view {jump.view} of "
+            f"{len(path)}: its motion is not smooth; the path holds the jump"
+        )
     if after**2 > _CHANCE * quiet**2 + _ANOTHER * problem.left_by_model:
         texts.append(
             "what the inset leaves of the readings along the path is more than noise "
-            f"({after:.2g} times): it does not move as one rigid body along a smooth path, parts "
-            "of it may move differently, turn or jump"
+            f"({after:.2g} times): it does not move as one rigid body along one path, parts of "
+            "it may move differently, turn or jump"
         )
     for text in texts:
         _LOG.warning("%s", text)
@@ -547,18 +710,131 @@ def estimate_motion(
         belief.evidence,
         size,
         (rest, after),
-        step,
+        found.steps,
         texts,
+        jump,
     )
 
 
-def _none(problem: _Problem, left: float, step: int) -> InsetMotion:
+@dataclass(frozen=True)
+class _Found:
+    """A path that was followed to where it does not change any more.
+
+    Attributes:
+        problem: whose coefficients they are.
+        before: coefficients about which the last equations were.
+        coefficients: of the path.
+        belief: of the last equations.
+        effects: of ``before``, of the last equations.
+        steps: iterations done.
+    """
+
+    problem: _Problem
+    before: Floats
+    coefficients: Floats
+    belief: _Belief
+    effects: _Effects
+    steps: int
+
+    @property
+    def path(self) -> Floats:
+        return self.problem.path(self.coefficients)
+
+    @property
+    def errors(self) -> Floats:
+        return self.problem.errors(self.belief.covariance)
+
+    @property
+    def jump(self) -> Jump | None:
+        """The jump of the path, if it may have one."""
+        if self.problem.jump is None:
+            return None
+        k = len(self.coefficients)
+        last = np.arange(3) * k + k - 1
+        return Jump(
+            self.problem.first_view(self.problem.jump),
+            self.coefficients[-1],
+            np.sqrt(np.diag(self.belief.covariance)[last] + _FLOOR_MM**2),
+        )
+
+
+def _followed(
+    problem: _Problem, at: Floats, tell: Callable[[float], None] = lambda _: None, before: int = 0
+) -> _Found | None:
+    """Gauss and Newton's iterations from coefficients; None: the inset shows nothing.
+
+    Args:
+        tell: called with the finished fraction.
+        before: iterations done before.
+
+    Raises:
+        ValueError: a path longer than is looked for.
+    """
+    effects: _Effects | None = None
+    for step in range(1, _STEPS + 1):
+        found, now = problem.at(at, effects)
+        if not np.diag(found.information).max() > 0.0:
+            return None
+        belief = _believed(found, at, problem.inflation, problem.jump is not None)
+        change = problem.path(belief.mean - at)
+        largest = float(np.abs(change).max())
+        here = at
+        at = at + (belief.mean - at) / max(1.0, largest / _LARGEST_STEP_MM)
+        farthest = float(np.abs(problem.path(at)).max())
+        if farthest > _REACH_MM:
+            raise ValueError(
+                f"the path that fits leads {farthest:.2g} mm away from its mean, more than the "
+                f"{_REACH_MM:g} mm that are looked for: the inset moves too far in this scan, or "
+                "what it holds is too faint for its motion to be found"
+            )
+        effects = now if largest < _NEAR_MM else None
+        tell(step / (_STEPS + 1))
+        if _rms(change) < _SETTLED * _rms(problem.errors(belief.covariance)):
+            break
+    return _Found(problem, here, at, belief, now, before + step)
+
+
+def _with_jump(smooth: _Found) -> _Found:
+    """The path with a jump where that makes the readings much likelier, or as it is."""
+    views = range(_JUMP_VIEWS, smooth.problem.geometry.views, _JUMP_VIEWS)
+    gain, view = _likeliest(smooth, views)
+    if gain <= _JUMP_EVIDENCE:
+        return smooth
+    finer, near = _likeliest(smooth, _about(smooth, view, _JUMP_VIEWS // 2))
+    view = near if finer > gain else view
+    found = smooth
+    start = np.vstack([smooth.before, np.zeros((1, 3))])
+    for _ in range(_JUMP_TIMES):
+        again = _followed(smooth.problem.with_jump(view), start, before=found.steps)
+        if again is None:
+            return smooth
+        found = again
+        gain, near = _likeliest(found, _about(found, view, _JUMP_REACH))
+        if gain <= 0.0:
+            break
+        view, start = near, found.coefficients
+    return found if found.belief.gain > _JUMP_EVIDENCE else smooth
+
+
+def _about(found: _Found, view: int, reach: int) -> list[int]:
+    """Averaged views about one, without it, at which a path can jump."""
+    last = min(view + reach, found.problem.geometry.views - 1)
+    return [v for v in range(max(1, view - reach), last + 1) if v != view]
+
+
+def _likeliest(found: _Found, views: Sequence[int]) -> tuple[float, int]:
+    """The largest gain of evidence by a jump at one of the views, and that view."""
+    gains = found.problem.gains(views, found.before, found.effects)
+    return float(gains.max()), views[int(gains.argmax())]
+
+
+def _none(problem: _Problem, left: float) -> InsetMotion:
     """Nothing is seen in the inset, so nothing of it is seen to move."""
     nowhere = np.zeros((len(problem.basis), 3))
     text = "the inset shows nothing above its noise whose motion could be found; none is applied"
     _LOG.warning("%s", text)
     unknown = np.full_like(nowhere, math.inf)
-    return InsetMotion(nowhere, unknown, False, 0.0, 0.0, (left, left), step, [text])
+    return InsetMotion(nowhere, unknown, False, 0.0, 0.0, (left, left), 1, [text])
 
 
 def _rms(path: Floats) -> float:

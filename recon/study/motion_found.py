@@ -26,7 +26,7 @@ from torchpcct.scene.plaque import Plaque, plaque_scene
 if TYPE_CHECKING:
     from torchpcct.typing import JsonObject
 
-__all__ = ["CASES", "found_paths"]
+__all__ = ["CASES", "AlongAxis", "Jump", "found_paths"]
 
 _SECOND_MM = (-3.3, 0.0)
 """Where the second vessel lies beside the plaque's, x and y, on the side away from the plaque."""
@@ -34,8 +34,6 @@ _SECOND_RADIUS_MM = 0.7
 """Its radius."""
 _SECOND_MOST_MM = 0.8
 """Largest motion at which the two do not meet."""
-_JUMP_AT = 0.5
-"""Share of the turn after which the vessel jumps."""
 
 
 class FoundSettings(Protocol):
@@ -60,7 +58,7 @@ class FoundSettings(Protocol):
 
 
 @dataclass(frozen=True)
-class _Along(SinusoidalMotion):
+class AlongAxis(SinusoidalMotion):
     """The sinusoid along the axis of the scanner."""
 
     @property
@@ -69,11 +67,17 @@ class _Along(SinusoidalMotion):
 
 
 @dataclass(frozen=True)
-class _Jump(SinusoidalMotion):
-    """All of the displacement at once, after half a turn of 0.35 s."""
+class Jump(SinusoidalMotion):
+    """All of the displacement at once.
+
+    Args:
+        at_s: when, after half a turn of 0.35 s if nothing else is said.
+    """
+
+    at_s: float = 0.5 * paper.ROTATION_S
 
     def displacement(self, times: ArrayLike) -> NDArray[np.float64]:
-        late = np.asarray(times, dtype=np.float64) >= _JUMP_AT * paper.ROTATION_S
+        late = np.asarray(times, dtype=np.float64) >= self.at_s
         return self.amplitude * late[..., None] * self._unit
 
 
@@ -85,12 +89,12 @@ CASES: Mapping[str, Callable[[float, float], tuple[SinusoidalMotion, ...]]] = {
     "at rest": lambda mm, rate: (),
     "along x": lambda mm, rate: (_sine("wall", mm, rate, 0.0),),
     "along y": lambda mm, rate: (_sine("wall", mm, rate, math.pi / 2),),
-    "along z": lambda mm, rate: (_Along("wall", mm, rate),),
+    "along z": lambda mm, rate: (AlongAxis("wall", mm, rate),),
     "ellipse": lambda mm, rate: (
         _sine("wall", mm, rate, 0.6),
         _sine("wall", 0.5 * mm, rate, 0.6 + math.pi / 2, math.pi / 2),
     ),
-    "jump along x": lambda mm, rate: (_Jump("wall", mm, rate),),
+    "jump along x": lambda mm, rate: (Jump("wall", mm, rate),),
     "two vessels, alike": lambda mm, rate: tuple(
         _sine(body, mm, rate, math.pi / 2) for body in ("wall", "second")
     ),

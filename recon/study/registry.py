@@ -38,6 +38,10 @@ STUDIES: dict[str, str] = {
         "residual motion in PCCT and EID-CT, and reconstruction with the motion known, "
         "exactly or not"
     ),
+    "paths": (
+        "the path of a moving inset, found from its own scan: errors and warnings on vessels drawn "
+        "at random"
+    ),
     "noise": (
         "FBP with every kernel, voxel size and dose: CNR tables, and which rankings they establish"
     ),

@@ -59,6 +59,12 @@ TINY: dict[str, dict[str, Any]] = {
         "found_exposures_s": (2.0,),
         "found_draws": 1,
     },
+    "paths": {
+        "kinds": ("at rest", "along a line"),
+        "vessels": 1,
+        "views": 48,
+        "exposures_s": (2.0,),
+    },
     "noise": {
         "realizations": 24,
         "views": 48,

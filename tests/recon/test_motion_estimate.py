@@ -13,7 +13,8 @@ import recon
 from recon.analytic.coverage import _at_rest, consistency_warnings
 from recon.analytic.inset import InsetFbp, view_motion
 from recon.least_squares.inset_problem import InsetProblem
-from recon.motion import _believed, _Problem, estimate_motion
+from recon.motion import _basis, _believed, _Problem, estimate_motion
+from recon.study.motion_found import Jump
 from recon.variable_projection import Normal
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, acquire, full_turn
 from torchpcct.geometry import project_points
@@ -57,6 +58,7 @@ def test_a_moving_inset_is_followed_and_shown_at_rest(moving):
     path, truth = np.array(said["path_mm"]), _truth(scan)[1]
     errors = np.array(said["errors_mm"])
     assert said["held"]
+    assert said["jump"] is None
     assert not any("move differently" in text for text in volume.report["warnings"])
     assert np.sqrt(((path - truth) ** 2).sum(1).mean()) < 0.06
     assert (np.abs(path - truth) < 3.5 * errors).all()
@@ -126,6 +128,22 @@ def test_readings_are_moved_to_where_they_would_be_at_rest(detector):
         torch.testing.assert_close(found, rest, rtol=0, atol=0.02)
 
 
+@pytest.mark.extended
+def test_a_jump_is_found_and_said():
+    """Along the ray of its view, where no view sees it."""
+    jump = Jump("vessel", 0.8, direction=0.0, at_s=0.5 * TURN_S)
+    scan = _scan(jump).with_noise(EXPOSURE_S, 0)
+    found = estimate_motion(scan, GRID)
+    path = view_motion(jump, scan.geometry, TURN_S)
+    off = found.path - path + path.mean(0)
+    assert found.jump is not None
+    assert abs(found.jump.view - 24) <= 1
+    assert np.linalg.norm(found.jump.mm - [0.0, 0.0, 0.8]) < 0.1
+    assert np.median(np.linalg.norm(off, axis=1)) < 0.05
+    assert "its motion is not smooth" in found.warnings[0]
+    assert found.report()["jump"]["view"] == found.jump.view
+
+
 def test_no_motion_is_invented():
     scan = _scan().with_noise(EXPOSURE_S, 1)
     found = estimate_motion(scan, GRID)
@@ -181,6 +199,23 @@ def test_what_the_readings_leave_open_stays_open():
         off = found.mean.T.ravel() - truth
         inside.append(np.abs(off) <= 2.0 * np.sqrt(np.diag(found.covariance)))
     assert 0.9 < np.mean(inside) < 0.995
+
+
+def test_a_jump_is_told_from_a_smooth_path():
+    """Of noisy displacements along one axis in every view."""
+    rng, times = np.random.default_rng(0), np.linspace(0.0, 1.0, 60)
+    smooth = _basis(times, None)
+    late = (times > 0.4) - np.mean(times > 0.4)
+    columns = np.column_stack([smooth, late])
+    seen = np.kron(np.eye(3), columns.T @ columns) / 0.05**2
+    for path, jumps in ((0.3 * smooth[:, 0] - 0.2 * smooth[:, 2], False), (0.3 * late, True)):
+        drawn = np.outer([0.0, 0.6, 0.8], path) + 0.05 * rng.standard_normal((3, 60))
+        pull = (drawn @ columns).ravel() / 0.05**2
+        found = _believed(Normal(seen, pull, seen, 1.0), np.zeros((7, 3)), 1.0, jumps=True)
+        assert (found.gain > 8.0) is jumps
+        assert found.mean[-1] == pytest.approx([0.0, 0.18 * jumps, 0.24 * jumps], abs=0.07)
+        off = columns @ found.mean - np.outer(path, [0.0, 0.6, 0.8])
+        assert np.sqrt((off**2).mean()) < 0.03
 
 
 def test_voxels_are_no_larger_than_cells(moving):

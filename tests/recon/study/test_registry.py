@@ -79,6 +79,7 @@ COUNTS = {
     "hardcases": "views",
     "motion": "thinning",
     "noise": "views",
+    "paths": "vessels",
     "phantom": "sections",
     "recovery": "places",
     "resolution": "thinning",
@@ -157,6 +158,12 @@ BAD = {
         ({"kernels": ("soft",), "voxels_mm": (0.2,)}, "two settings"),
         ({"experiments": 1}, "experiments"),
         ({"reconstructed": 0}, "reconstructed"),
+    ],
+    "paths": [
+        ({"kinds": ()}, "at least one each"),
+        ({"kinds": ("a spiral",)}, "a spiral"),
+        ({"exposures_s": (0.0,)}, "exposures_s"),
+        ({"views": 40}, "views"),
     ],
     "recovery": [
         ({"balls": ()}, "at least one each"),
