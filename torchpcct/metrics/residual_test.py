@@ -36,6 +36,7 @@ import torch
 from scipy import special, stats
 from torch import Tensor
 
+from torchpcct.metrics.residual_sums import TINY, Weighted, level_weights, readings, sums
 from torchpcct.validate import checked, coverage, number
 
 __all__ = ["ResidualTest", "residual_test"]
@@ -47,11 +48,6 @@ MISFIT = 0.03
 blur of edges that the data see; 1 % on the paper's plaque."""
 COARSE = 1.0
 """Part of χ² that voxels may add at edges without being a finding: as much as noise itself."""
-QUIET = 1.0
-"""Square of the steps to neighbouring readings, over the variance of the noise, up to which a
-reading is none at an edge: of a step voxels leave a third at most, 0.1 of the variance."""
-EDGE = 1.0 / 3.0
-"""Part of such a step that voxels leave at most."""
 _FEWEST_QUIET = 200
 """Readings without edges below which χ² beside edges is not tested."""
 _FEWEST_BENDS = 8
@@ -88,8 +84,6 @@ drift by 2 %: 7 to 145 times)."""
 COMMON_SLOW = 8.0
 """The same of slow drifts: in sound scans up to 30 times in seven patterns together (drifts by 2 %:
 54 times and more)."""
-_TINY = torch.finfo(torch.float32).tiny
-"""What a weight is divided by that is 0."""
 _LARGE = 1e5
 """Mean from which on the tails of χ² are those of a transformed normal."""
 
@@ -146,39 +140,20 @@ def residual_test(
             "residual, weights and fitted must have one shape (views, rows, columns), got "
             f"{tuple(residual.shape)}, {tuple(weights.shape)} and {tuple(fitted.shape)}"
         )
-    # Readings are compared in their own precision, of their sums the tests are double.
-    w = weights.to(torch.promote_types(residual.dtype, torch.float32))
-    count = int((w > 0).sum())
-    if not bool((w >= 0).all()) or count == 0:
-        raise ValueError(
-            "weights must be 0 or more, and some greater than 0: give inverse variances"
-        )
-    r, lines = (torch.where(w > 0, v.to(w.dtype), 0.0) for v in (residual, fitted))
-    if not bool(torch.isfinite(r).all() and torch.isfinite(lines).all()):
-        raise ValueError("residual and fitted must be finite where the weight is not 0")
-    wr = w * r
-    chi2 = float((wr * r).sum()) / count
+    of = sums(residual, weights, fitted)
+    few = of.quiet < min(_FEWEST_QUIET, of.count / 2)
+    if few or not of.level:
+        of = sums(residual, weights, fitted, all_quiet=few, all_level=not of.level)
+    count, chi2 = of.count, of.chi2 / of.count
     level = false_alarms / 5.0
     p_values, sizes, findings = {}, {}, []
 
-    along = [_steps(lines, axis) for axis in range(3)]
-    largest = torch.stack(along).amax(0)
-    # Whether the object ends beyond the outermost rows, or just within them, no reading says.
-    beyond = torch.zeros_like(w, dtype=torch.bool)
-    if residual.shape[1] > 1:
-        beyond[:, [0, -1]] = (w * lines.square() > QUIET)[:, [0, -1]]
-    quiet = (w * largest.square() <= QUIET) & ~beyond
-    few = int((quiet & (w > 0)).sum()) < min(_FEWEST_QUIET, count / 2)
-    if few:
-        quiet = torch.ones_like(quiet)
-    calm, calm_r = torch.where(quiet, w, 0.0), torch.where(quiet, wr, 0.0)
-
     # χ²: too low only if the noise is less than stated, by more than what the unknowns have taken
     # up.
-    number_calm = int((calm > 0).sum())
-    chi2_calm = float((calm_r * r).sum()) / number_calm
-    spread, spread_calm = math.sqrt(2.0 / count), math.sqrt(2.0 / number_calm)
-    gains = _gains(calm, calm_r, _gain_variance(calm, calm_r)) / number_calm
+    chi2_calm = of.quiet_chi2 / of.quiet
+    spread, spread_calm = math.sqrt(2.0 / count), math.sqrt(2.0 / of.quiet)
+    calm = of.quiet_cells
+    gains = _gains(calm, _gain_variance(calm, of.quiet)) / of.quiet
     # Of edges alone nobody knows what voxels leave.
     above = -math.inf if few else (chi2_calm - 1.0 - MISFIT - gains) / spread_calm
     below = (1.0 - MISFIT - min(unknowns / count, 1.0) - chi2) / spread
@@ -200,19 +175,16 @@ def residual_test(
                 "scan, or something outside of the grid was left out"
             )
 
-    of_voxels = w * (EDGE * largest).square()
     # Of few rows those between two slices are many, of one row none are.
     rows = max(1.0, _ROWS / residual.shape[1]) if residual.shape[1] > 1 else 1.0
     leaks = rows * sum(
-        part * min(max(chi2 - 1.0 - least, 0.0) * count, float(of_voxels.sum()))
+        part * min(max(chi2 - 1.0 - least, 0.0) * count, of.of_voxels)
         for part, least in zip(LEAK, (0.0, COARSE), strict=True)
     )
 
-    shifted = torch.zeros_like(lines)
-    shifted[..., 1:-1] = (lines[..., 2:] - lines[..., :-2]) / 2.0
-    power = float((w * shifted.square()).sum())
+    score, power = of.shift
     if power > 0.0:
-        score = float((shifted * wr).sum()) / math.sqrt(power)
+        score /= math.sqrt(power)
         p_values["centre"], sizes["centre"] = (
             float(2.0 * stats.norm.sf(abs(score))),
             score / math.sqrt(power),
@@ -225,10 +197,7 @@ def residual_test(
                 "(the detector's column offset) is wrong"
             )
 
-    # A view at another angle differs by a part of what neighbouring views do.
-    turned = torch.zeros_like(lines)
-    turned[1:-1] = (lines[2:] - lines[:-2]) / 2.0
-    weight, total = _sum(w * turned.square(), 1), _sum(wr * turned, 1)
+    total, weight = of.turned
     if bool((weight > 0).any()):
         tolerated = ANGLE_TOLERANCE**2 * float(weight.sum())
         p_values["angles"] = _in_common(total, weight, None, tolerated)
@@ -244,48 +213,40 @@ def residual_test(
                 "measured angle of each view"
             )
 
-    # Of a face along the rows voxels leave the same in all columns and views, of other steps a part
-    # in either direction: noise of its own.
-    level_rows = torch.where(w * along[1].square() <= QUIET, w, 0.0)
-    if not bool((level_rows > 0).any()):
-        level_rows = w
-    level_r = level_rows * r
-    inner = level_rows.clone()
-    if residual.shape[1] > 1:
-        inner[:, [0, -1]] = 0.0
-    of_cells = _gain_variance(level_rows, level_r)
+    of_cells = _gain_variance(of.level_cells, of.level)
     for name, axes, parts in (("views", (1, 2), 4), ("rows", (0, 2), 2)):
         gain = GAIN_TOLERANCE * (rows if name == "rows" else 1.0)
         patterns: list[Tensor | None] = [None]
         # Every view alone, and the slow drifts over all of them, which add up what single views
         # cannot tell.
-        if name == "views" and len(w) > 4 * _HARMONICS:
-            patterns.append(_slow(len(w)))
+        if name == "views" and len(residual) > 4 * _HARMONICS:
+            patterns.append(_slow(len(residual)))
         # Whatever lies off in rows that end in others, by more than all that voxels leave.
-        weight = _sum(inner, axes)
-        noise = _sum(inner * of_voxels, axes) + of_cells * _sum(_cells_squared(inner, name), -1)
-        noisier = 1.0 + noise / weight.clamp_min(_TINY)
-        weight, total = weight / noisier, _sum(inner * r, axes) / noisier
+        some = of.views if name == "views" else of.rows
+        total, weight = some.inner
+        noisier = 1.0 + (some.of_voxels + of_cells * some.inner_squared) / weight.clamp_min(TINY)
+        weight, total = weight / noisier, total / noisier
         tolerated = gain**2 * float(weight.sum()) + leaks
         tails = [_upper_tail(*_alike(total, weight, p), tolerated) for p in patterns]
         # What all columns have in common, by more than voxels leave: that differs among them.
-        seen, total = _beside_object(level_rows, r, lines, name)
-        weight, total = _sum(seen, axes[0]), _sum(total, axes[0])
-        noise = of_cells * _sum(_cells_squared(seen, name), -1)[:, None]
-        noisier = 1.0 + noise / weight.sum(1, keepdim=True).clamp_min(_TINY)
+        total, weight = some.beside
+        noise = of_cells * some.beside_squared[:, None]
+        noisier = 1.0 + noise / weight.sum(1, keepdim=True).clamp_min(TINY)
         weight, total = weight / noisier, total / noisier
         # Faces in some rows leave gains of others, alike in all columns; of views they do not.
         tolerated = gain**2 * float(weight.sum()) + (leaks if name == "rows" else 0.0)
         tails += [_in_common(total, weight, p, tolerated) for p in patterns]
         p_values[name] = float(min(1.0, parts * min(tails)))
         if p_values[name] < level:
-            weight = _sum(level_rows, axes)
+            w, r, lines = readings(residual, weights, fitted)
+            w = w if of.all_level else level_weights(w, lines)
+            weight = _sum(w, axes)
             known = weight > 0
-            size = float((_sum(level_r, axes)[known] / weight[known]).square().mean().sqrt())
+            size = float((_sum(w * r, axes)[known] / weight[known]).square().mean().sqrt())
             findings.append(
                 f"the readings of some {name} lie above or below what the volume projects to, "
                 f"{100 * size:.2g} % of intensity (root mean square): "
-                f"{_cause(name, level_rows, level_r, lines, axes)}"
+                f"{_cause(name, w, w * r, lines, axes)}"
             )
     return ResidualTest(chi2, p_values, sizes, tuple(findings))
 
@@ -294,27 +255,17 @@ def _sum(values: Tensor, axes: int | tuple[int, ...]) -> Tensor:
     return values.sum(axes).double()
 
 
-def _steps(lines: Tensor, axis: int) -> Tensor:
-    """The larger difference of each of ``(views, rows, columns)`` to a neighbour along an axis."""
-    found = torch.zeros_like(lines)
-    step = lines.diff(dim=axis).abs()
-    for first in (0, 1):
-        part = found.narrow(axis, first, step.shape[axis])
-        part.copy_(torch.maximum(part, step))
-    return found
-
-
-def _gain_variance(weight: Tensor, total: Tensor) -> float:
+def _gain_variance(of: Weighted, readings: int) -> float:
     """Variance of the gains of single cells, which the noise of air leaves: constant over the
     views, and independent from column to column. At most that of one frame of air at the scan's own
     exposure, whose noise is that of a reading.
 
     Args:
-        weight: ``(views, rows, columns)``.
-        total: weight times residual.
+        of: of the cells ``(rows, columns)``.
+        readings: of positive weight, from which the sums are.
     """
-    cells, off = _sum(weight, 0), _sum(total, 0)
-    gains = off / cells
+    cells = of.weight
+    gains = of.total / cells
     bend = gains[:, :-2] - 2.0 * gains[:, 1:-1] + gains[:, 2:]
     of_noise = (1.0 / cells[:, :-2]) + 4.0 / cells[:, 1:-1] + 1.0 / cells[:, 2:]
     known = torch.isfinite(bend) & torch.isfinite(of_noise)
@@ -323,16 +274,15 @@ def _gain_variance(weight: Tensor, total: Tensor) -> float:
     bend, of_noise = bend[known], of_noise[known]
     # ⟨bend² / v⟩ = 1 + 6 σ² / v of bends whose noise has the variance v.
     found = float((bend.square() / of_noise - 1.0).sum() / (6.0 / of_noise).sum())
-    return min(max(found, 0.0), 1.0 / float(weight[weight > 0].mean()))
+    return min(max(found, 0.0), readings / float(cells.sum()))
 
 
-def _gains(weight: Tensor, total: Tensor, variance: float) -> float:
+def _gains(of: Weighted, variance: float) -> float:
     """What gains of cells add to the sum of χ²: those of this variance, and of all that are
     constant over the views as far as :data:`GAIN_TOLERANCE` goes."""
-    cells, off = _sum(weight, 0), _sum(total, 0)
-    known = cells > 0
-    excess = float((off[known].square() / cells[known] - 1.0).sum())
-    return min(max(excess, 0.0), max(GAIN_TOLERANCE**2, variance) * float(cells.sum()))
+    known = of.weight > 0
+    excess = float((of.total[known].square() / of.weight[known] - 1.0).sum())
+    return min(max(excess, 0.0), max(GAIN_TOLERANCE**2, variance) * float(of.weight.sum()))
 
 
 def _upper_tail(value: float, degrees: int, noncentrality: float) -> float:
@@ -409,46 +359,6 @@ def _alike(total: Tensor, weight: Tensor, patterns: Tensor | None) -> tuple[floa
     return float(score @ torch.linalg.pinv(gram, hermitian=True) @ score), len(patterns)
 
 
-def _cells_squared(weight: Tensor, name: str) -> Tensor:
-    """Squares of what a gain of each cell, constant over the views, adds to the sum of a view or
-    row of ``(views, rows, columns)``: ``(views, cells)`` or ``(rows, columns)``."""
-    return weight.square().flatten(1) if name == "views" else _sum(weight, 0).square()
-
-
-def _beside_object(weight: Tensor, r: Tensor, lines: Tensor, name: str) -> tuple[Tensor, Tensor]:
-    """Weights, and weights times what is left of the residual where each view and row has a part
-    of what looks like the object itself; all ``(views, rows, columns)``.
-
-    Voxels end with a slice, an object within it: as it comes nearer to the source in some views,
-    a row sees more of it than of the voxels. In the outermost rows nobody knows where it ends.
-    """
-    if lines.shape[1] == 1:
-        return weight, weight * r
-    if name == "views":
-        seen, left = weight.clone(), weight * r
-        for row in ([0], [-1]):
-            seen[:, row], left[:, row] = _beside_lines(weight[:, row], r[:, row], lines[:, row])
-        return seen, left
-    return _beside_lines(weight, r, lines)
-
-
-def _beside_lines(weight: Tensor, r: Tensor, lines: Tensor) -> tuple[Tensor, Tensor]:
-    """The part of :func:`_beside_object` that fits gain and part of the object together, in every
-    view and row; of the gain's information a share is left."""
-
-    def total(values: Tensor) -> Tensor:
-        return (weight * values).sum(2, keepdim=True)
-
-    power = total(lines.square()).clamp_min(_TINY)
-    pattern = 1.0 - lines * (total(lines) / power)
-    known = total(pattern.square())
-    gain = total(pattern * r) / known.clamp_min(_TINY)
-    left = r - lines * (total(lines * (r - gain)) / power)
-    share = known / weight.sum(2, keepdim=True).clamp_min(_TINY)
-    seen = weight * share
-    return seen, seen * left
-
-
 def _in_common(total: Tensor, weight: Tensor, patterns: Tensor | None, tolerated: float) -> float:
     """Probability that what all columns of a view or row have in common is of noise, or of what
     voxels leave.
@@ -470,13 +380,13 @@ def _in_common(total: Tensor, weight: Tensor, patterns: Tensor | None, tolerated
     # As much information in each.
     so_far = information.cumsum(0) - information / 2.0
     at = (so_far / information.sum() * blocks).long().clamp_max(blocks - 1)
-    empty = torch.zeros((len(weight), blocks), dtype=weight.dtype)
-    w, s = (empty.index_add(1, at, v) for v in (weight, total))
+    members = torch.nn.functional.one_hot(at, blocks).to(weight.dtype)
+    w, s = weight @ members, total @ members
     together, degrees = _alike(s.sum(1), w.sum(1), patterns)
     if patterns is None:
-        sizes = s.sum(1) / w.sum(1).clamp_min(_TINY)
+        sizes = s.sum(1) / w.sum(1).clamp_min(TINY)
         off = s - sizes[:, None] * w
-        apart = float((off.square() / w.clamp_min(_TINY)).sum())
+        apart = float((off.square() / w.clamp_min(TINY)).sum())
         others = int((w > 0).sum()) - degrees
     else:
         grams = torch.einsum("kv,vb,lv->bkl", patterns, w, patterns)

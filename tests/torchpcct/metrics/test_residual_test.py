@@ -9,6 +9,7 @@ import torch
 from refusals import refused
 from scipy import stats
 
+from torchpcct.metrics import residual_sums
 from torchpcct.metrics.residual_test import _upper_tail, residual_test
 
 SHAPE = (60, 6, 24)
@@ -43,6 +44,23 @@ def test_false_alarms_keep_their_rate():
     assert alarms >= 150 * 0.02
     assert stats.kstest([f.p_values["centre"] for f in found], "uniform").pvalue > 1e-3
     assert sum(bool(residual_test(noise(s), W, LINES).findings) for s in range(150)) <= 5
+
+
+@pytest.mark.parametrize("rows", [1, 2, 6])
+@pytest.mark.parametrize("steep", [False, True])
+def test_sums_do_not_depend_on_the_blocks_of_views(rows, steep, monkeypatch):
+    """Those of all views at once are sums over blocks, each with the views beside it."""
+    weights = W * (noise(3) > -0.03)
+    lines = LINES + 5.0 * noise(4).abs() if steep else LINES
+    given = [v[:, :rows].contiguous() for v in (noise(1) + shifted(-0.1), weights, lines)]
+    whole = residual_test(*given)
+    monkeypatch.setattr(residual_sums, "_BLOCK", 1)
+    monkeypatch.setattr(residual_sums, "_FEWEST_VIEWS", 7)
+    parts = residual_test(*given)
+    assert parts.p_values == pytest.approx(whole.p_values, rel=1e-8)
+    assert parts.sizes == pytest.approx(whole.sizes, rel=1e-9)
+    assert parts.chi2 == pytest.approx(whole.chi2, rel=1e-12)
+    assert parts.findings == whole.findings
 
 
 def test_a_quarter_of_a_column_is_found_and_measured():
