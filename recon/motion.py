@@ -117,7 +117,7 @@ _JUMP_TIMES = 3
 """Places of a jump that the path is followed with, at most."""
 _JUMP_EVIDENCE = 8.0
 """Logarithm of the marginal likelihood's ratio to the smooth path, from which on a jump is
-believed. Of eleven smooth motions it is -6 to -2, of six jumps 30 to 900."""
+believed. Of six smooth motions it is -5 to -3, of six jumps 30 to 900."""
 _NEGLIGIBLE = 1e-7
 """Share of the whole below which a prior does nothing."""
 _SMOOTH_VOXELS = 1.0

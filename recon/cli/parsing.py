@@ -598,6 +598,12 @@ def map_beside(volume: Path) -> Path:
     return volume.with_name(f"{name}_drawn_minus_plain{volume.name[len(name) :]}")
 
 
+def motion_beside(volume: Path) -> tuple[Path, Path]:
+    """Table and picture of the path that was taken out of a volume, beside it."""
+    name = without_ending(volume)
+    return volume.with_name(f"{name}_motion.csv"), volume.with_name(f"{name}_motion.png")
+
+
 def without_ending(path: Path) -> str:
     """The name of a scan, a volume or a folder without what says its format."""
     name = path.resolve().name

@@ -31,8 +31,10 @@ from recon.cli.parsing import (
     command,
     executing,
     find_modules_here,
+    is_picture,
     length_of,
     map_beside,
+    motion_beside,
     tell,
     without_ending,
 )
@@ -58,6 +60,7 @@ if TYPE_CHECKING:
     from torchpcct.scan import Scan
     from torchpcct.scene.voxels import VoxelScene
     from torchpcct.typing import JsonObject
+    from torchpcct.volume import Volume
 
 _PAPER_VIEWS = 1968
 """Views of a turn in the paper."""
@@ -654,6 +657,11 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
         )
     check_target(arguments.out)
     check_output(arguments, is_own_volume, arguments.scan, arguments.geometry, beside=True)
+    if arguments.motion is not None:
+        for path, is_own in zip(
+            motion_beside(arguments.out), (_is_path_table, is_picture), strict=True
+        ):
+            check_output(argparse.Namespace(**{**vars(arguments), "out": path}), is_own)
     for name in ("extent", "center"):
         given = getattr(arguments, name)
         if given is not None and len(given) not in (2, 3):
@@ -723,9 +731,32 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
         beside = map_beside(arguments.out)
         replace(volume, data=changed, report={}).save(beside)
         volume = replace(volume, report={**volume.report, _MAP: beside.name})
+    if arguments.motion is not None:
+        volume = _with_path(volume, *motion_beside(arguments.out))
     volume.save(arguments.out)
     report = {**volume.report, "mean": float(volume.data.mean())}
     _tell_volume(arguments, config, volume.grid, volume.unit, report)
+
+
+def _is_path_table(path: Path) -> bool:
+    """Whether a file is a table of a path, as :func:`recon.motion_path.path_table` writes it."""
+    from recon.motion_path import TABLE_HEADER
+
+    with path.open("rb") as file:
+        return file.read(200).split(b"\n")[0].decode("utf-8", "replace") == ",".join(TABLE_HEADER)
+
+
+def _with_path(volume: Volume, table: Path, picture: Path) -> Volume:
+    """The volume with the names of the files in its report to which its path was written."""
+    from recon.motion_path import path_figure, path_table
+
+    motion = volume.report["motion"]
+    with atomic_write(table) as part:
+        part.write_text(path_table(motion), encoding="utf-8")
+    with atomic_write(picture) as part:
+        path_figure(motion).savefig(part, format="png")
+    named = {**motion, "table": table.name, "picture": picture.name}
+    return replace(volume, report={**volume.report, "motion": named})
 
 
 def _config(
@@ -906,7 +937,8 @@ def add_reconstruct(commands: Commands) -> None:
             str,
             None,
             "estimate: find the rigid motion of an inset (a scan with region) from its readings, "
-            "and take it out; the path with its errors is in the report",
+            "and take it out; the path with its errors is in the report, and beside the volume as "
+            "_motion.csv and _motion.png",
             {"choices": ["estimate"]},
         ),
         group="method",

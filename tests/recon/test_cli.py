@@ -18,6 +18,7 @@ from small_scan import GRID
 from recon.cli import main
 from recon.cli.parsing import as_options, saying
 from recon.mbir.known import Drawn
+from recon.motion import InsetMotion
 from recon.study.results import README_MARKS
 from recon.vessel.known import KnownVessel
 from torchpcct import ConeBeam, ParallelBeam, Scan, Volume, VolumeGrid, __version__, full_turn
@@ -373,6 +374,22 @@ def test_a_scan_of_a_region_is_reconstructed_there(here, cli, clean):
     assert "mine.h5 can only be read as a whole: leave out --memory SIZE" in said
     assert "damaged" not in said
     assert "--slices A:B" in cli("reconstruct mine.h5 --slices 1:2 --out other.nii", 2)
+
+
+def test_a_path_is_written_beside_the_volume(here, cli, clean, monkeypatch):
+    clean.with_noise(1.0, 0).save("mine.h5")
+    still = np.zeros((clean.geometry.views, 3))
+    found = InsetMotion(still, still + 0.02, True, 9.0, 0.1, (1.0, 1.0), 2)
+    monkeypatch.setattr("recon.motion.estimate_motion", lambda scan, grid: found)
+    (here / "a_motion.csv").write_text("my own", encoding="utf-8")
+    assert "a_motion.csv exists" in cli("reconstruct mine.h5 --motion estimate --out a.mha", 2)
+    assert (here / "a_motion.csv").read_text(encoding="utf-8") == "my own"
+    cli("reconstruct mine.h5 --motion estimate --out b.nii.gz")
+    report = json.loads((here / "b.nii.gz.json").read_text(encoding="utf-8"))["motion"]
+    assert (report["table"], report["picture"]) == ("b_motion.csv", "b_motion.png")
+    assert len((here / "b_motion.csv").read_text(encoding="utf-8").splitlines()) == 1 + len(still)
+    assert (here / "b_motion.png").read_bytes().startswith(b"\x89PNG")
+    cli("reconstruct mine.h5 --motion estimate --out b.nii.gz")  # onto its own files
 
 
 def test_what_a_drawn_vessel_has_changed_is_written_and_shown(here, cli, clean, monkeypatch):
