@@ -12,9 +12,16 @@ os.environ.setdefault("TRITON_INTERPRET", "1")
 
 @pytest.fixture(scope="session", autouse=True)
 def _a_cache_of_its_own(tmp_path_factory):
-    """Commands keep readings and locks in the user's cache: here in a folder of the tests."""
+    """Commands keep readings and locks in the user's cache: here in a folder of the tests.
+
+    Matplotlib's list of fonts stays where the user has it: made anew, it takes each process that
+    draws more than a second.
+    """
+    import matplotlib
+
     folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MPLCONFIGDIR", matplotlib.get_cachedir())
         patch.setenv("XDG_CACHE_HOME", str(folder))
         yield folder
 

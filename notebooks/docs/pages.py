@@ -4,6 +4,7 @@ results."""
 import argparse
 import ast
 import base64
+import functools
 import importlib.util
 import json
 import re
@@ -14,6 +15,7 @@ HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 
 
+@functools.cache
 def public_modules():
     """Modules without an underscore in their names, by package: ``{package: [(module, own, others),
     …]}``.

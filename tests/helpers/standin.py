@@ -18,7 +18,6 @@ from unittest import mock
 import numpy as np
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
-from torch.utils._pytree import tree_flatten, tree_map_only
 
 from recon.analytic.backproject import BackprojectionPlan
 from recon.mbir import bilateral, bilateral_triton
@@ -75,23 +74,28 @@ class Counter(TorchDispatchMode):
         self.copies: list[tuple[int, str]] = []
         self.scalars = 0
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """Nothing is compiled here; torch would load its compiler to leave it out."""
+        return False
+
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         return _run(func, args, kwargs or {}, self)
 
 
 def _asked() -> str:
     """The package's own function that asked for a copy."""
-    for frame in reversed(traceback.extract_stack()):
-        own = "/torchpcct/" in frame.filename or "/recon/" in frame.filename
-        if own and "/tests/" not in frame.filename:
-            return frame.name
+    for frame, _ in traceback.walk_stack(None):
+        file = frame.f_code.co_filename
+        if ("/torchpcct/" in file or "/recon/" in file) and "/tests/" not in file:
+            return frame.f_code.co_name
     return "test"
 
 
 def _run(func: Any, args: Any, kwargs: Any, counter: Counter | None) -> Any:
-    flat = [a for a in tree_flatten((args, kwargs))[0] if isinstance(a, torch.Tensor)]
-    there = [a for a in flat if isinstance(a, Standin)]
-    here = [a for a in flat if not isinstance(a, Standin)]
+    there, here = list[Standin](), list[torch.Tensor]()
+    inner_args = _inner(args, there, here)
+    inner_kwargs = {name: _inner(value, there, here) for name, value in kwargs.items()}
     device = kwargs.get("device")
     wanted = None if device is None else torch.device(device)
     moves = func in (_aten._to_copy.default, _aten.copy_.default)
@@ -107,21 +111,39 @@ def _run(func: Any, args: Any, kwargs: Any, counter: Counter | None) -> Any:
     if home and counter is not None:
         counter.copies.append((there[0].numel(), _asked()))
     if wanted == DEVICE:
-        kwargs = {**kwargs, "device": torch.device("cpu")}
+        inner_kwargs["device"] = torch.device("cpu")
     if func is _aten._conj.default:  # its lazy form is not honoured below the dispatcher
         func = _aten.conj_physical.default
-    inner_args, inner_kwargs = tree_map_only(Standin, lambda t: t.inner, (args, kwargs))
     out = func(*inner_args, **inner_kwargs)
     if home or not (there or wanted == DEVICE):
         return out
 
-    def wrapped(made: torch.Tensor) -> torch.Tensor:
+    def wrapped(made: Any) -> Any:
+        if isinstance(made, (tuple, list)):
+            return [wrapped(value) for value in made]
+        if not isinstance(made, torch.Tensor):
+            return made
         for given in there:
             if given.inner is made:  # in place
                 return given
         return Standin(made)
 
-    return tree_map_only(torch.Tensor, wrapped, out)
+    return wrapped(out)
+
+
+def _inner(value: Any, there: list[Standin], here: list[torch.Tensor]) -> Any:
+    """Of arguments of an operator what the CPU is given; their tensors are added to the two lists.
+
+    By hand: torch's own walk through trees takes most of a test's time.
+    """
+    if isinstance(value, Standin):
+        there.append(value)
+        return value.inner
+    if isinstance(value, torch.Tensor):
+        here.append(value)
+    elif isinstance(value, (tuple, list)):
+        return [_inner(v, there, here) for v in value]
+    return value
 
 
 class _Passes:

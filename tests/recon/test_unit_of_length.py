@@ -86,7 +86,7 @@ def scan(name, k):
 @pytest.mark.parametrize("name", list(CASES))
 def test_fbp_and_pwls(name, method):
     wanted = reconstruct(*scan(name, 1.0), method)
-    for k in SCALES:
+    for k in SCALES if method == "fbp" else (SCALES[0], SCALES[-1]):
         found = reconstruct(*scan(name, k), method)
         torch.testing.assert_close(found.data, wanted.data, atol=0.1, rtol=0)
         assert len(found.report["warnings"]) == len(wanted.report["warnings"])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recon.evaluate.task import Task
-from recon.evaluate.tasks import TASKS, VesselTask, read_task
+from recon.evaluate.tasks import TASKS, VesselTask, read_task, task_text
 from recon.evaluate.vessels import SHAPES, PaintedVessel
 from recon.jobs.store import Store
 from torchpcct import VolumeGrid
@@ -18,7 +18,7 @@ from torchpcct.scene.plaque import Plaque
 from torchpcct.scene.raster import label_fractions
 
 HU = {"patient": -92.65, "wall": 63.53, "fibrous": 103.22, "lumen": 479.97, "core": 41.07}
-PAINTED = [name for name in TASKS if isinstance(read_task(name), VesselTask)]
+PAINTED = [name for name in TASKS if "\nvessel:" in task_text(name)]
 BENCH = Path(__file__).parents[2] / "bench"
 POINTS = 1 << 14
 

@@ -79,6 +79,13 @@ def processes():
 
 
 @pytest.fixture(scope="module")
+def process():
+    """One is enough for most tests, and starts in half the time."""
+    with Processes(1, 1) as executor:
+        yield executor
+
+
+@pytest.fixture(scope="module")
 def cluster():
     """Of two machines: addresses of this one that look like two.
 
@@ -295,9 +302,9 @@ def warnings_off():
         yield
 
 
-def test_a_lambda_is_computed_here(task, processes, tmp_path, caplog):
+def test_a_lambda_is_computed_here(task, process, tmp_path, caplog):
     mine = Method("mine", lambda realisation: realisation.fbp("soft"), kernels=("soft",))
-    found = evaluate(task, ["fbp:soft", mine], n=8, folder=tmp_path, executor=processes)
+    found = evaluate(task, ["fbp:soft", mine], n=8, folder=tmp_path, executor=process)
     assert {r["method"] for r in found.records} == {"fbp:soft", "mine"}
     assert "mine is computed here, not by other processes" in caplog.text
 
@@ -369,15 +376,15 @@ def test_a_job_that_kills_workers_of_a_cluster_is_left_out_alone(cluster, tmp_pa
     assert len(list(tmp_path.glob("o*.txt"))) == 9
 
 
-def test_what_a_job_itself_refuses_ends_the_run(processes, tmp_path):
+def test_what_a_job_itself_refuses_ends_the_run(process, tmp_path):
     with pytest.raises(ValueError, match="bad input"):
-        run([Job("bad", refuses, ())], tmp_path, processes)
+        run([Job("bad", refuses, ())], tmp_path, process)
     with pytest.raises(execute.Unportable):
-        run([Job("lambda", lambda folder: None, ())], tmp_path, processes)
+        run([Job("lambda", lambda folder: None, ())], tmp_path, process)
 
 
-def test_threads_of_all_libraries_are_the_workers(processes, tmp_path):
-    assert run([Job("t", threads_of, ())], tmp_path, processes)["t"] == (1, 1, 1)
+def test_threads_of_all_libraries_are_the_workers(process, tmp_path):
+    assert run([Job("t", threads_of, ())], tmp_path, process)["t"] == (1, 1, 1)
 
 
 @pytest.mark.extended
@@ -620,14 +627,14 @@ def test_what_is_installed_while_a_worker_runs_it_does_not_have(tmp_path):
     assert _content(path) == found
 
 
-def test_another_version_is_refused(processes, tmp_path, monkeypatch):
+def test_another_version_is_refused(process, tmp_path, monkeypatch):
     monkeypatch.setattr(execute, "VERSION", "0.0.9")
     with pytest.raises(ValueError, match=r"has another torchpcct.*install the same one"):
-        run([Job("x", noted, ("x", 1))], tmp_path, processes)
+        run([Job("x", noted, ("x", 1))], tmp_path, process)
     monkeypatch.undo()
     monkeypatch.setattr(execute, "source_digest", lambda module: "others")
     with pytest.raises(ValueError, match="has another torchpcct"):
-        run([Job("x", noted, ("x", 1))], tmp_path, processes)
+        run([Job("x", noted, ("x", 1))], tmp_path, process)
 
 
 @pytest.mark.cluster

@@ -24,29 +24,33 @@ def lines():
     return Projector(GEOMETRY, big)(torch.from_numpy(body).float().expand(big.shape))
 
 
-def test_nothing_is_left_of_a_uniform_inset(lines):
-    """Every row: a path of 8 mm through 1 HU is 1.6e-4."""
+@pytest.fixture(scope="module")
+def around():
     window = footprint(GEOMETRY, GRID, margin=1)
-    around = UnknownSurround(GEOMETRY, GRID, window, Projector(GEOMETRY, GRID, window))
+    return UnknownSurround(GEOMETRY, GRID, window, Projector(GEOMETRY, GRID, window))
+
+
+@pytest.fixture(scope="module")
+def left(around, lines):
+    return around.take_off(lines, 0.02)
+
+
+def test_nothing_is_left_of_a_uniform_inset(around, lines, left):
+    """Every row: a path of 8 mm through 1 HU is 1.6e-4."""
     assert around.level(lines) == pytest.approx(0.02, abs=3 * HU)
-    left = around.take_off(lines, 0.02)
-    assert left.shape == window.shape
+    assert left.shape == around.window.shape
     assert float(lines.max()) > 2.0
     assert float(left.mean((0, 2)).abs().max()) < 2e-4
 
 
-def test_what_the_inset_holds_stays_its_own(lines):
+def test_what_the_inset_holds_stays_its_own(around, lines, left):
     """A ball in it: its readings are left, and nothing of it is taken for surround (once 12 %
     were)."""
-    window = footprint(GEOMETRY, GRID, margin=1)
-    projector = Projector(GEOMETRY, GRID, window)
     z, y, x = np.meshgrid(*GRID.axes, indexing="ij")
     ball = torch.from_numpy(0.02 * (np.hypot(np.hypot(y - 12.0, x + 15.0), z) < 1.8)).float()
-    around = UnknownSurround(GEOMETRY, GRID, window, projector)
-    whole = Projector(GEOMETRY, GRID)
-    plain, holding = (around.take_off(v, 0.02) for v in (lines, lines + whole(ball)))
-    own = projector(ball)
-    error = holding - plain - own
+    holding = around.take_off(lines + Projector(GEOMETRY, GRID)(ball), 0.02)
+    own = around.projector(ball)
+    error = holding - left - own
     assert abs(float(error.mean())) < 0.03 * float(own.mean())
 
 

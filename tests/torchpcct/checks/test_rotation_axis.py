@@ -100,14 +100,14 @@ def test_what_cannot_tell_the_axis_is_refused():
         rotation_axis(scanned(g, radius, 60.0, 1e4, 0.0, 0), g)
 
 
-@pytest.mark.parametrize("kind", ["parallel", "flat", "cone"])
-@pytest.mark.parametrize("turn", ["full", "half"])
+@pytest.mark.parametrize(
+    ("kind", "turn"),
+    [("parallel", "full"), ("parallel", "half"), ("flat", "full"), ("cone", "full")],
+)
 def test_noise_tells_no_axis(kind, turn):
     """Air alone: an axis was stated, of another column in every draw."""
-    if turn == "half" and kind != "parallel":
-        return
     g, _ = beam(kind, TURNS[turn](60))
-    for seed in range(6):
+    for seed in range(3):
         noise = np.random.default_rng(seed).standard_normal(g.shape)
         with pytest.raises(ValueError, match="do not tell the axis"):
             rotation_axis(torch.from_numpy(0.01 * noise.astype(np.float32)), g)
