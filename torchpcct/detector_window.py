@@ -106,6 +106,29 @@ class DetectorWindow:
             out[..., view, :, :] = kept[..., first : first + self.columns]
         return out
 
+    def less(self, values: Tensor, cells: Tensor, out: Tensor | None = None) -> Tensor:
+        """Readings of the window less what stands at their cells, ``values - take(cells)``, view
+        by view: what is taken off is never held for all views at once.
+
+        Args:
+            values: ``(..., views, rows, columns)``.
+            cells: ``(..., rows, columns)`` of the whole detector, on the device and of the dtype of
+                ``values``.
+            out: where the result is written, ``values`` itself for instance; None: a new tensor.
+        """
+        if values.device.type != "cpu" or values.ndim != cells.ndim + 1:
+            return torch.sub(values, self.take(cells), out=out)
+        if out is None:
+            out = torch.empty_like(values, dtype=torch.result_type(values, cells))
+        kept = cells[..., self.first_row : self.first_row + self.rows, :]
+        for view, first in enumerate(self.first_column.tolist()):
+            torch.sub(
+                values[..., view, :, :],
+                kept[..., first : first + self.columns],
+                out=out[..., view, :, :],
+            )
+        return out
+
     def crop(self, values: Tensor, inner: DetectorWindow) -> Tensor:
         """The readings of a smaller window: ``(..., views, rows, columns)`` on this window to those
         on ``inner``.

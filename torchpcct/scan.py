@@ -507,7 +507,7 @@ class Scan:
         p = self._logarithm()
         if not (self.noise_free or self.logged) and self.electronic_noise == 0.0:
             self._unbias(p)
-        p = self.linearisation.apply(p, self.window)
+        p = self.linearisation.apply(p, self.window, overwrite=True)
         return p if self.dead is None else interpolate_dead(p, self.dead, self.geometry.has_rows)
 
     def _unbias(self, p: Tensor) -> None:
@@ -528,7 +528,11 @@ class Scan:
         positive = self._positive()
         if self.dead is not None:
             positive.masked_fill_(self.dead, 1.0)
-        p = positive.log_().neg_().add_(self._at_window(self.air.log()))
+        p = positive.log_()
+        if self.window is None:
+            p.sub_(self._at_window(self.air.log())).neg_()
+        else:
+            self.window.less(p, self.air.log(), out=p).neg_()
         return p if self.flux is None else p.add_(self._per_view(self.flux.log()))
 
     def _per_view(self, values: Tensor) -> Tensor:

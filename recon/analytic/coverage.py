@@ -259,7 +259,7 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid, motion: Floats | None = N
     if lines.ndim > len(geometry.shape):
         lines = lines[lines.shape[0] // 2]
     if window is not None:
-        lines = lines - window.take(scan.surround_line_integrals())
+        lines = window.less(lines, scan.surround_line_integrals())
         if motion is not None:
             lines = _at_rest(lines, geometry, about, check_motion(motion, geometry.views, 3))
         found = list(geometry_test(lines, geometry, window, about).findings)
@@ -405,7 +405,7 @@ def _surround_texts(scan: Scan) -> list[str]:
     and of odd number alike, as gains do and noise does not."""
     window = scan.window
     assert window is not None
-    lines = (scan.line_integrals() - window.take(scan.surround_line_integrals())).double()
+    lines = window.less(scan.line_integrals(), scan.surround_line_integrals()).double()
     if lines.ndim != 3 or lines.shape[-1] < 4 * _BORDER or lines.shape[0] < _FEWEST_VIEWS:
         return []
     found = []

@@ -245,7 +245,7 @@ class InsetFbp:
                 f"lines must have the channels {channels} before the views, got "
                 f"{tuple(lines.shape)}"
             )
-        difference = lines - self.window.take(self._lines.to(lines.dtype))
+        difference = self.window.less(lines, self._lines.to(lines.dtype))
         filtered = self.plan.filtered(difference, held=self.window)
         if self.moving is self.plan:
             filtered = filtered + self._over_batch(self._surround.to(lines.dtype), filtered)

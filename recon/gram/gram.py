@@ -108,16 +108,16 @@ def make_definite(spectra: Tensor) -> Tensor:
             f"got the shape {tuple(spectra.shape)}"
         )
     terms, bands, nz = spectra.shape[:3]
-    flat = spectra.reshape(terms, bands, nz, -1).to(torch.complex128).numpy().copy()
+    given = spectra.reshape(terms, bands, nz, -1)
+    flat = given.to(torch.complex128, copy=True).numpy()
     level = np.abs(flat[0, 0].real).mean(axis=0)
 
     from recon.gram.kernels import damp, stiffen  # numba loads with its first use
 
-    plain = flat.copy()
     definite = np.zeros(flat.shape[-1], dtype=np.bool_)
     run(stiffen, definite.size, flat, _points(terms), LEAST_PIVOT, STIFFNESS, ADDITIONS, definite)
     todo = np.flatnonzero(~definite)
-    flat[..., todo] = plain[..., todo]
+    flat[..., todo] = given[..., todo].numpy()
     kept = np.array(KEPT if terms > 1 else ())
     least = 1e-9 * level.max()
     run(

@@ -64,17 +64,23 @@ def _first_failure(matrix, least, lower):
     none."""
     bands, nz = matrix.shape
     for j in range(nz):
+        inverse = 0.0
         for b in range(min(bands, nz - j)):
-            value = matrix[b, j]
+            # Real and imaginary parts by themselves: numba divides by a complex number.
+            re, im = matrix[b, j].real, matrix[b, j].imag
             for i in range(max(0, j + b - bands + 1), j):
-                value -= lower[j + b - i, i] * lower[j - i, i].conjugate()
+                here, own = lower[j + b - i, i], lower[j - i, i]
+                re -= here.real * own.real + here.imag * own.imag
+                im -= here.imag * own.real - here.real * own.imag
             if b == 0:
                 diagonal = matrix[0, j].real
-                if not (diagonal > 0.0 and value.real > least * diagonal):
+                if not (diagonal > 0.0 and re > least * diagonal):
                     return j
-                lower[0, j] = math.sqrt(value.real)
+                root = math.sqrt(re)
+                inverse = 1.0 / root
+                lower[0, j] = root
             else:
-                lower[b, j] = value / lower[0, j].real
+                lower[b, j] = complex(re * inverse, im * inverse)
     return -1
 
 
@@ -107,12 +113,18 @@ def stiffen(begin, end, terms, points, least, step, most, definite):
         definite: ``(frequencies,)`` bool, whether it succeeded.
     """
     count, bands, nz, _ = terms.shape
+    own = np.empty((count, bands, nz), dtype=np.complex128)
+    matrix = np.empty((bands, nz), dtype=np.complex128)
+    lower = np.empty((bands, nz), dtype=np.complex128)
     for f in range(begin, end):
-        matrix = np.empty((bands, nz), dtype=np.complex128)
-        lower = np.empty((bands, nz), dtype=np.complex128)
+        # A copy in one place: in memory the bands of a frequency lie a whole slice apart.
+        for c in range(count):
+            for b in range(bands):
+                for z in range(nz):
+                    own[c, b, z] = terms[c, b, z, f]
         level = 0.0
         for z in range(nz):
-            level += abs(terms[0, 0, z, f].real) / nz
+            level += abs(own[0, 0, z].real) / nz
         added = 0
         good = True
         k = 0
@@ -120,9 +132,9 @@ def stiffen(begin, end, terms, points, least, step, most, definite):
         while passed < points.shape[0]:
             for b in range(bands):
                 for z in range(nz):
-                    value = terms[0, b, z, f]
+                    value = own[0, b, z]
                     for c in range(1, count):
-                        value += points[k, c] * terms[c, b, z, f]
+                        value += points[k, c] * own[c, b, z]
                     matrix[b, z] = value
             j = _first_failure(matrix, least, lower)
             if j < 0:
@@ -137,10 +149,14 @@ def stiffen(begin, end, terms, points, least, step, most, definite):
             upper = max(j, 1)
             # Larger doses where many were needed.
             stiffness = step * level * (1.0 + 0.05 * added)
-            terms[0, 0, upper, f] += stiffness
-            terms[0, 0, upper - 1, f] += stiffness
-            terms[0, 1, upper - 1, f] -= stiffness
+            own[0, 0, upper] += stiffness
+            own[0, 0, upper - 1] += stiffness
+            own[0, 1, upper - 1] -= stiffness
         definite[f] = good
+        if added:
+            for b in range(bands):
+                for z in range(nz):
+                    terms[0, b, z, f] = own[0, b, z]
 
 
 @njit(nogil=True, cache=True)

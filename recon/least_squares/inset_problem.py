@@ -207,7 +207,7 @@ class InsetProblem:
         lines = near.line_integrals()
         if near is scan:
             lines = self.outer.crop(lines, self.window)
-        return lines - self.window.take(self._background)
+        return self.window.less(lines, self._background)
 
     @undisturbed
     def term(self, scan: Scan, data: Tensor | None = None) -> Quadratic:

@@ -35,6 +35,22 @@ def test_cropping_keeps_each_reading_at_its_cell():
     assert torch.equal(outer.crop(outer.take(cells), inner), inner.take(cells))
 
 
+@pytest.mark.parametrize("bins", [(), (2,)])
+def test_what_is_taken_off_every_view_is_that_of_its_cells(bins):
+    window = DetectorWindow(np.array([2, 4]), 6, 1, 3)
+    cells = torch.rand(*bins, 5, 12, dtype=torch.float64)
+    values = torch.rand(*bins, *window.shape)
+    left = values - window.take(cells)
+    assert torch.equal(window.less(values, cells), left)
+    assert window.less(values, cells).dtype == left.dtype
+    # Several scans at once share the cells.
+    both = torch.stack([values, 2 * values])
+    assert torch.equal(window.less(both, cells)[1], 2 * values - window.take(cells))
+    own = left.clone()
+    assert window.less(own, cells, out=own) is own
+    assert torch.equal(own, left - window.take(cells))
+
+
 def test_the_full_window_is_the_whole_detector():
     for geometry in (
         FanBeam([0.0, 1.0], 50.0, 90.0, 7, 1.0),

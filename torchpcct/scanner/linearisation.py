@@ -158,7 +158,9 @@ class WaterLinearisation:
         )
         return cls(coefficients, scale, mu_ref)
 
-    def _evaluate(self, p: Tensor, window: DetectorWindow | None, *, slope: bool) -> Tensor:
+    def _evaluate(
+        self, p: Tensor, window: DetectorWindow | None, *, slope: bool, overwrite: bool = False
+    ) -> Tensor:
         # numba: presets load without it
         from torchpcct.scanner.linearisation_kernel import evaluate
 
@@ -187,7 +189,7 @@ class WaterLinearisation:
             first = np.zeros(1, np.int64)
         else:
             first = np.repeat(window.first_column, window.rows)
-        out = torch.empty_like(flat)
+        out = flat if overwrite else torch.empty_like(flat)
         work = flat.shape[1] * 3 * self.coefficients.shape[1]
         terms = np.ascontiguousarray(self.coefficients.T)
         run(
@@ -224,13 +226,16 @@ class WaterLinearisation:
         inside = scale * x
         return (inside * value + (p - inside) * bend).to(p.dtype)
 
-    def apply(self, p: Tensor, window: DetectorWindow | None = None) -> Tensor:
+    def apply(
+        self, p: Tensor, window: DetectorWindow | None = None, *, overwrite: bool = False
+    ) -> Tensor:
         """Water-equivalent line integrals ``mu_ref t``.
 
         Args:
             p: ``(..., columns)`` polychromatic line integrals; with a window ``(..., views, rows,
                 window.columns)``.
             window: the part of the detector that ``p`` holds.
+            overwrite: whether ``p`` may be overwritten: nobody else needs it.
 
         Returns:
             Tensor of the shape, dtype and device of ``p``. NaN stays NaN. Not differentiable: see
@@ -239,7 +244,7 @@ class WaterLinearisation:
         Raises:
             ValueError: a shape that does not fit the detector or the window.
         """
-        return self._evaluate(p, window, slope=False)
+        return self._evaluate(p, window, slope=False, overwrite=overwrite)
 
     def slope(self, p: Tensor, window: DetectorWindow | None = None) -> Tensor:
         """Derivative of :meth:`apply`: what it multiplies the standard deviation of ``p`` by."""

@@ -32,9 +32,20 @@ def evaluate(
     # Term by term over a whole line: what stands side by side in memory is computed at once.
     for i in range(begin, end):
         start = first_column[i % first_column.size]
+        beyond = 0
         for j in range(columns):
-            x[j] = min(max(float(p[i, j]) / scale[start + j], 0.0), 1.0)
+            at = float(p[i, j]) / scale[start + j]
+            beyond += not 0.0 <= at <= 1.0
+            x[j] = min(max(at, 0.0), 1.0)
             value[j] = local[j] = 0.0
+        if not slope and beyond == 0:
+            for k in range(coefficients.shape[0] - 1, -1, -1):
+                term = coefficients[k, start : start + columns]
+                for j in range(columns):
+                    value[j] = value[j] * x[j] + term[j]
+            for j in range(columns):
+                out[i, j] = float(p[i, j]) * value[j]
+            continue
         for k in range(coefficients.shape[0] - 1, -1, -1):
             term = coefficients[k, start : start + columns]
             for j in range(columns):

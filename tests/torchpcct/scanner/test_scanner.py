@@ -128,6 +128,19 @@ def test_water_reads_linear_from_0_to_380_mm(make):
         np.testing.assert_allclose(linear, 1.0, atol=2e-5, err_msg=f"{t} mm")
 
 
+def test_a_reading_is_corrected_alike_whatever_stands_beside_it(pcct):
+    lin = pcct.water_linearisation()
+    p = torch.linspace(0.1, 4.0, 1500, dtype=torch.float64).expand(3, 1500).clone()
+    alone = lin.apply(p)
+    p[1, 7] = -0.3  # continued straight
+    torch.testing.assert_close(lin.apply(p)[1, 8:], alone[1, 8:], rtol=1e-14, atol=0.0)
+    p[1, 7] = float("nan")
+    assert lin.apply(p)[1].isnan().nonzero().tolist() == [[7]]
+    expected = lin.apply(p)
+    assert lin.apply(p, overwrite=True).data_ptr() == p.data_ptr()
+    torch.testing.assert_close(p, expected, equal_nan=True, rtol=0, atol=0)
+
+
 def test_the_water_correction_is_tame_outside_its_range(pcct):
     lin = pcct.water_linearisation()
     p = torch.linspace(-0.5, 20.0, 801, dtype=torch.float64)[:, None].expand(-1, 1500)
