@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from torchpcct.projector.cpu.symmetry import (
     no_orbits,
     place,
 )
-from torchpcct.projector.operator import apply_linear
+from torchpcct.projector.operator import apply_linear, is_free
 from torchpcct.projector.rays import rays_of
 from torchpcct.threads import run
 from torchpcct.validate import checked
@@ -133,6 +133,7 @@ class BackprojectionPlan:
         window.check(geometry)
         self.cosines, self.sines = np.cos(geometry.angles), np.sin(geometry.angles)
         self.shifts = _shifts(motion, self.cosines, self.sines, grid.ndim)
+        self.motion = motion if is_free(motion) else None
         self.travel = float(np.hypot(self.shifts[:, 0], self.shifts[:, 1]).max())
         if self.kind != 0 and grid.in_plane_radius + self.travel >= self.sod:
             raise ValueError(
@@ -275,7 +276,10 @@ class BackprojectionPlan:
         )
 
     def __call__(self, filtered: Tensor) -> Tensor:
-        """:meth:`forward`, differentiable, of data on any device."""
+        """:meth:`forward`, differentiable, of data on any device; of a motion that wants
+        gradients, of first order by both."""
+        if self.motion is not None:
+            return cast(Tensor, _AlongMotion.apply(filtered, self.motion, self))
         return apply_linear(filtered, self.forward, self.transpose)
 
     def _there(self, like: Tensor) -> tuple[Any, ...]:
@@ -344,25 +348,56 @@ class BackprojectionPlan:
             outside = torch.from_numpy(np.broadcast_to(self.mask, self.grid.shape).ravel().copy())
             flat = flat.masked_fill(outside.to(flat.device), 0.0)
         batch = torch.arange(len(out), device=flat.device)[:, None]
-        double: Any = {"dtype": torch.float64, "device": flat.device}
-        z, y, x = (
-            torch.from_numpy(axis.copy()).to(**double)
-            for axis in (self.grid.axes if self.cone else (np.zeros(1), *self.grid.axes))
-        )
+        axes = self._axes(flat.device)
         for v in range(w.views):
-            for cell, weight in self._neighbours(v, z[:, None, None], y[:, None], x):
+            for cell, weight in self._neighbours(v, *axes):
                 values = flat * weight.to(flat)
                 where = batch.expand(values.shape), cell.expand(values.shape)
                 out[:, v].index_put_(where, values, accumulate=True)
         return out.view(*lead, w.views, *cells)
 
+    def _axes(self, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+        """Places of the voxels, z, y and x, which broadcast."""
+        z, y, x = (
+            torch.from_numpy(axis.copy()).to(device)
+            for axis in (self.grid.axes if self.cone else (np.zeros(1), *self.grid.axes))
+        )
+        return z[:, None, None], y[:, None], x
+
+    def by_motion(self, data: Tensor, gradient: Tensor) -> Tensor:
+        """Gradient of ⟨gradient, forward(data)⟩ by the motion, ``(views, axes)`` float64.
+
+        Args:
+            data: ``(..., views, [rows,] columns)``.
+            gradient: ``(..., [z,] y, x)``.
+        """
+        n = self.grid.ndim
+        flat = gradient.reshape(-1, *self.grid.shape)
+        if self.mask is not None:
+            flat = flat.masked_fill(torch.from_numpy(self.mask).to(flat.device), 0.0)
+        flat = flat.flatten(1)
+        cells = data.reshape(-1, *data.shape[-n:]).flatten(2)
+        axes = self._axes(data.device)
+        found = torch.zeros(self.window.views, 3, dtype=torch.float64)
+        for v in range(self.window.views):
+            shift = torch.tensor(self.shifts[v], device=data.device, requires_grad=True)
+            with torch.enable_grad():
+                total = shift.new_zeros(())
+                for cell, weight in self._neighbours(v, *axes, shift=shift):
+                    total = total + ((flat * cells[:, v, cell]).sum(0).double() * weight).sum()
+            found[v] = torch.autograd.grad(total, shift)[0].cpu()
+        toward, aside, up = found.unbind(1)
+        c, s = torch.from_numpy(self.cosines), torch.from_numpy(self.sines)
+        plane = [toward * s + aside * c, toward * c - aside * s]
+        return torch.stack([up, *plane] if self.cone else plane, 1)
+
     def _neighbours(
-        self, view: int, z: Tensor, y: Tensor, x: Tensor
+        self, view: int, z: Tensor, y: Tensor, x: Tensor, shift: Tensor | None = None
     ) -> Iterator[tuple[Tensor, Tensor]]:
         """Of one view the readings that voxels are interpolated between, flattened, and their
-        weights, ``(voxels,)`` each."""
+        weights, ``(voxels,)`` each; ``shift``: the view's :attr:`shifts` as a tensor."""
         c, s = float(self.cosines[view]), float(self.sines[view])
-        toward, aside, up = (float(shift) for shift in self.shifts[view])
+        toward, aside, up = self.shifts[view].tolist() if shift is None else shift
         across, depth = y * c - x * s + aside, (self.sod - toward) - (x * c + y * s)
         distance = depth
         if self.kind == _KIND["parallel"]:
@@ -539,6 +574,46 @@ class BackprojectionPlan:
         return out.view(*lead, *shape)
 
 
+class _MotionContext(Protocol):
+    """What a backprojection along a motion keeps for its derivatives."""
+
+    plan: BackprojectionPlan
+    saved_tensors: tuple[Tensor, ...]
+    needs_input_grad: tuple[bool, ...]
+
+    def save_for_backward(self, *tensors: Tensor) -> None: ...
+
+
+class _AlongMotion(torch.autograd.Function):
+    """Backprojection with gradients by the data and by the motion.
+
+    A volume is piecewise smooth in the motion: as of the projector's readings, a second derivative
+    by it says nothing.
+    """
+
+    @staticmethod
+    def forward(filtered: Tensor, motion: Tensor, plan: BackprojectionPlan) -> Tensor:
+        return plan.forward(filtered)
+
+    @staticmethod
+    def setup_context(
+        ctx: _MotionContext, inputs: tuple[Tensor, Tensor, BackprojectionPlan], output: Tensor
+    ) -> None:
+        filtered, motion, ctx.plan = inputs
+        ctx.save_for_backward(filtered, motion)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: _MotionContext, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        filtered, motion = ctx.saved_tensors
+        (gradient,) = gradients
+        by_data = ctx.plan.transpose(gradient) if ctx.needs_input_grad[0] else None
+        by_motion = None
+        if ctx.needs_input_grad[1]:
+            by_motion = ctx.plan.by_motion(filtered, gradient).to(motion)
+        return by_data, by_motion, None
+
+
 def _between(position: Tensor, cells: int) -> list[tuple[Tensor, Tensor]]:
     """The two cells about each place and their shares; the outermost cell is repeated."""
     at = position.clamp(0.0, cells - 1.0)
@@ -590,9 +665,11 @@ def backproject(
             y, x) mm as for :class:`torchpcct.projector.Projector`, or None: everything that the
             data hold moves with the grid, and the image shows it at rest. What stands still must be
             backprojected on its own, without motion (see :class:`recon.analytic.inset.InsetFbp`).
+            By a tensor that requires a gradient the image has one.
 
     Returns:
-        ``(..., *grid.shape)`` mm⁻¹, dtype and device of ``filtered``. Differentiable to any order.
+        ``(..., *grid.shape)`` mm⁻¹, dtype and device of ``filtered``. Differentiable to any order;
+        by a motion, to the first.
 
     Raises:
         ValueError: a wrong shape, a grid outside the field of view or the source's orbit, a window

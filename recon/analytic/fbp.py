@@ -26,7 +26,7 @@ from torchpcct.angles import view_steps
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.devices import require_room
 from torchpcct.geometry import Beam, Geometry, VolumeGrid, beam, view_step
-from torchpcct.projector.operator import apply_linear
+from torchpcct.projector.operator import apply_linear, is_free
 from torchpcct.readings import interpolate_dead
 from torchpcct.validate import checked, number, reals
 from torchpcct.vector_geometry import VectorGeometry
@@ -219,11 +219,13 @@ def fbp(
 
     Returns:
         ``(..., *grid.shape)`` mm⁻¹; with a sequence of kernels a leading axis of kernels.
-        Differentiable to any order (columns that were added beyond the edges count as constant).
+        Differentiable to any order (columns that were added beyond the edges count as constant);
+        by a ``motion`` that is a tensor and requires a gradient, to the first.
 
     Raises:
         ValueError, TypeError: as :func:`filter_sinogram` and
-            :func:`~recon.analytic.backproject.backproject`; views of which more than a quarter is
+            :func:`~recon.analytic.backproject.backproject`; gradients by the motion of a
+            VectorGeometry; views of which more than a quarter is
             dead; a negative ``outside``.
 
     Example:
@@ -238,6 +240,12 @@ def fbp(
         0.02
     """
     if isinstance(geometry, VectorGeometry):
+        if is_free(motion):
+            raise ValueError(
+                "FBP has gradients by a motion of parallel, fan and cone beams: of a "
+                "VectorGeometry give the motion as numbers (.detach()), or use Projector, which "
+                "has them on every geometry"
+            )
         lines, circle = rebin_to_circle(
             sinogram, geometry if motion is None else geometry.moved(motion)
         )
@@ -253,8 +261,9 @@ def fbp(
             outside=outside,
         )
     check_data("sinogram", sinogram, geometry.shape)
-    refuse_helix(geometry, motion)
-    for text in check_rows(geometry, grid, motion):
+    path = _plain(motion)
+    refuse_helix(geometry, path)
+    for text in check_rows(geometry, grid, path):
         _LOG.warning("%s", text)
     lines = _without_dead(sinogram, geometry)
     weights = _check_weights(weights, geometry, grid)
@@ -310,11 +319,8 @@ class FbpPlan:
     ) -> None:
         self.geometry, self.grids, self.kernel = beam(geometry), tuple(grids), kernel
         self._sides, self._outside, self._whole_rows = sides, outside, window is None
-        self._travel = (
-            0.0
-            if motion is None
-            else float(np.hypot(*np.asarray(motion, dtype=np.float64)[:, -2:].T).max())
-        )
+        path = _plain(motion)
+        self._travel = 0.0 if path is None else float(np.hypot(*path[:, -2:].T).max())
         # What a grid needs of an offset detector's short scan is not known of several at once.
         only = self.grids[0] if len(self.grids) == 1 else None
         self.weights = angular_weights(geometry, only) if weights is None else weights
@@ -322,7 +328,7 @@ class FbpPlan:
         self.completed, self._completed_weights = shape_only.geometry, shape_only.weights
         self.window = (
             DetectorWindow.union(
-                [_footprint_or_all(self.completed, grid, motion) for grid in self.grids],
+                [_footprint_or_all(self.completed, grid, path) for grid in self.grids],
                 self.completed.columns,
             )
             if window is None
@@ -401,7 +407,8 @@ class FbpPlan:
 
 
 class Fbp(nn.Module):
-    """:func:`fbp` of one geometry on one grid as a layer of a network, without parameters.
+    """:func:`fbp` of one geometry on one grid as a layer of a network, without parameters of its
+    own.
 
     Shape: ``(..., views, [rows,] columns)`` → ``(..., *grid.shape)``: axes of batch and channel go
         through. float32 or float64; float16 and bfloat16, as autocast leaves them, are computed and
@@ -411,11 +418,21 @@ class Fbp(nn.Module):
         geometry: parallel, fan or cone beam.
         grid: ``(y, x)`` or ``(z, y, x)``.
         kernel: reconstruction kernel.
+        motion: of :func:`fbp`. Of a tensor that requires a gradient images have one, of first
+            order; its values are read at every pass, so that an optimiser may change them, and an
+            ``nn.Parameter`` is one of the layer's.
     """
 
-    def __init__(self, geometry: Geometry, grid: VolumeGrid, kernel: str = "standard") -> None:
+    def __init__(
+        self,
+        geometry: Geometry,
+        grid: VolumeGrid,
+        kernel: str = "standard",
+        *,
+        motion: object = None,
+    ) -> None:
         super().__init__()
-        self.geometry, self.grid, self.kernel = geometry, grid, kernel
+        self.geometry, self.grid, self.kernel, self.motion = geometry, grid, kernel, motion
         self._enter()
 
     def _enter(self) -> None:
@@ -428,13 +445,20 @@ class Fbp(nn.Module):
         self._enter()
 
     def forward(self, sinogram: Tensor) -> Tensor:
+        if is_free(self.motion):
+            return self._apart(sinogram)
         if torch.compiler.is_compiling():
             return cast(Tensor, _traced(sinogram, self._handle))
         return self._computed(sinogram)
 
+    @torch.compiler.disable  # one operation of a traced graph knows no gradient by the motion
+    def _apart(self, sinogram: Tensor) -> Tensor:
+        return self._computed(sinogram)
+
     def _computed(self, sinogram: Tensor) -> Tensor:
         narrow = isinstance(sinogram, Tensor) and sinogram.dtype in (torch.float16, torch.bfloat16)
-        return fbp(sinogram.float() if narrow else sinogram, self.geometry, self.grid, self.kernel)
+        lines = sinogram.float() if narrow else sinogram
+        return fbp(lines, self.geometry, self.grid, self.kernel, motion=self.motion)
 
     def extra_repr(self) -> str:
         return (
@@ -556,6 +580,15 @@ def _cut_sides(
             stacklevel=4,
         )
     return sides
+
+
+def _plain(motion: object) -> NDArray[np.float64] | None:
+    """A motion as numbers, of a tensor that requires a gradient, too."""
+    if motion is None:
+        return None
+    if isinstance(motion, Tensor):
+        motion = motion.detach().cpu().numpy()
+    return np.asarray(motion, dtype=np.float64)
 
 
 def _footprint_or_all(geometry: Geometry, grid: VolumeGrid, motion: object) -> DetectorWindow:

@@ -348,7 +348,7 @@ def _engine(
     window: DetectorWindow | None,
     motion: Tensor | ArrayLike | None,
 ) -> Engine | PosedEngine:
-    if not _is_free(motion) and not isinstance(geometry, ParametricGeometry):
+    if not is_free(motion) and not isinstance(geometry, ParametricGeometry):
         return Engine(_tables(geometry, grid, window, motion))
     scan = geometry if isinstance(geometry, ParametricGeometry) else with_parameters(geometry)
     if motion is not None and not isinstance(motion, Tensor):
@@ -356,7 +356,7 @@ def _engine(
     return PosedEngine(scan, grid, window, motion)
 
 
-def _is_free(motion: object) -> bool:
+def is_free(motion: object) -> bool:
     """Whether somebody wants derivatives by a motion, backward or forward."""
     if not isinstance(motion, Tensor):
         return False

@@ -11,7 +11,7 @@ from linear_maps import mismatch
 from refusals import refused
 
 from recon.analytic.backproject import BackprojectionPlan, backproject
-from recon.analytic.fbp import fbp
+from recon.analytic.fbp import Fbp, fbp
 from recon.analytic.inset import InsetFbp, view_motion
 from recon.least_squares.inset_problem import InsetProblem
 from recon.least_squares.qggmrf import QGGMRF
@@ -21,6 +21,7 @@ from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full
 from torchpcct.scanner import presets
 from torchpcct.scene import Body, Scene, SinusoidalMotion
 from torchpcct.scene.bodies import Ellipsoid, EllipticCylinder
+from torchpcct.vector_geometry import VectorGeometry
 
 ANGLES = full_turn(12, 0.2)
 PLANE = VolumeGrid((9, 7), 0.9, (6.0, -12.0))
@@ -222,3 +223,45 @@ def test_refusals(scans, path):
         ("rotation_s", lambda: view_motion(SinusoidalMotion("vessel", 1.0), geometry, 0.0)),
         ("surround at rest", lambda: InsetFbp(whole, [GRID], ["soft"], motion=path)),
     )
+
+
+def _readings_and_motion(kind):
+    """Random ones, float64, of a scan in :data:`SCANS`."""
+    geometry, grid = SCANS[kind]
+    random = torch.Generator().manual_seed(3)
+    lines = torch.randn(2, *geometry.shape, generator=random, dtype=torch.float64)
+    return lines, 0.3 * torch.randn(len(ANGLES), grid.ndim, generator=random, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("kind", SCANS)
+def test_gradients_by_readings_and_motion(kind):
+    geometry, grid = SCANS[kind]
+    lines, motion = _readings_and_motion(kind)
+    expected = fbp(lines, geometry, grid, motion=motion)
+    lines.requires_grad_()
+    motion.requires_grad_()
+
+    def made(lines, motion):
+        return fbp(lines, geometry, grid, motion=motion)
+
+    torch.testing.assert_close(made(lines, motion), expected, rtol=0, atol=0)
+    assert torch.autograd.gradcheck(made, (lines, motion), fast_mode=True, atol=1e-7)
+
+
+def test_an_optimiser_may_change_the_motion_of_a_layer():
+    geometry, grid = SCANS["cone"]
+    lines, motion = _readings_and_motion("cone")
+    layer = Fbp(geometry, grid, motion=torch.nn.Parameter(motion))
+    assert [p.shape for p in layer.parameters()] == [motion.shape]
+    before = layer(lines).square().sum()
+    before.backward()
+    with torch.no_grad():
+        layer.motion -= 1e-3 * layer.motion.grad / layer.motion.grad.norm()
+    after = layer(lines).square().sum()
+    step = -1e-3 * float(layer.motion.grad.norm())
+    assert (after - before).item() == pytest.approx(step, rel=0.05)
+    (first,) = torch.autograd.grad(after, layer.motion, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        first.sum().backward()
+    with pytest.raises(ValueError, match="or use Projector"):
+        fbp(lines, VectorGeometry.of(geometry), grid, motion=motion.requires_grad_())
