@@ -9,7 +9,7 @@ dead readings from their neighbours, so that they do not spread over the image.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, TypedDict
 
@@ -40,6 +40,8 @@ FEWEST = 0.3
 """Expected counts from which on the logarithm is corrected: see :func:`log_bias`."""
 MANY = 10.0
 """Expected counts up to which it is."""
+_MUCH_NOISE = 50.0
+"""Electronic noise in counts beside which that of photons is as good as normal, too."""
 _AVERAGED = 10.0
 """Readings that :func:`smoothed` averages over in effect, of a sinogram; of a cone beam 26."""
 _FEW = 1000.0
@@ -462,35 +464,84 @@ def inverse_variance(mean: Tensor, quantum: Tensor, electronic_noise: float) -> 
     )
 
 
-@lru_cache(maxsize=1)
-def _log_bias() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """ln m, and what the logarithm of Poisson counts, E ln(n + ½), lies above it; from the sum
-    over all n."""
-    m = np.geomspace(FEWEST, MANY, 200)
-    n = np.arange(int(MANY + 12 * math.sqrt(MANY)))[:, None]
-    factorial = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, len(n))))])[:, None]
-    probability = np.exp(n * np.log(m) - m - factorial)
-    return np.log(m), (probability * np.log(n + 0.5)).sum(0) - np.log(m)
-
-
-def log_bias(mean: Tensor) -> Tensor:
-    """Mean of ln(n + ½) less the logarithm of the mean, of Poisson counts n.
-
-    0.03 at two counts, 0.17 at one, 0.8 at ``FEWEST``: it takes the darkest rays for brighter than
-    they are.
+def expected(
+    mean: NDArray[np.float64],
+    noise: float,
+    function: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+) -> NDArray[np.float64]:
+    """Expectation of a function of Poisson counts to which electronics add normal noise, from the
+    sum over all of them.
 
     Args:
-        mean: expected counts, estimated from some ten readings (:func:`smoothed`). Above ``MANY``
-            the bias is 0; below ``FEWEST`` it is that of so many, for the estimate itself says no
-            more.
+        mean: ``(k,)`` expected counts, greater than 0.
+        noise: standard deviation of the electronics, in counts.
+        function: of an array of counts, elementwise.
     """
-    known, bias = _log_bias()
-    if mean.device.type != "cpu":
-        return _of_table((mean + 0.5 / _AVERAGED).log(), known, bias, math.log(MANY))
+    z = np.linspace(-6.0, 6.0, 121) if noise else np.zeros(1)
+    weight = np.exp(-z * z / 2.0) / np.exp(-z * z / 2.0).sum()
+    found: NDArray[np.float64]
+    if noise > _MUCH_NOISE:
+        spread = np.sqrt(mean + noise**2)[:, None]
+        found = function(mean[:, None] + spread * z) @ weight
+        return found
+    most = float(mean.max())
+    n = np.arange(int(most + 12.0 * math.sqrt(most)) + 12)
+    factorial = np.concatenate([[0.0], np.cumsum(np.log(n[1:]))])
+    probability = np.exp(n * np.log(mean)[:, None] - mean[:, None] - factorial)
+    found = probability @ (function(n[:, None] + noise * z) @ weight)
+    return found
+
+
+def fewest(noise: float) -> float:
+    """Expected counts from which on the logarithm is corrected: half of what some ten readings with
+    so much electronic noise must expect to be known to a half; ``FEWEST`` without any."""
+    return (FEWEST + math.sqrt(FEWEST**2 + 4.0 * FEWEST * noise**2)) / 2.0
+
+
+def many(noise: float) -> float:
+    """Expected counts up to which the logarithm is corrected, where electronics add noise; ``MANY``
+    where they do not."""
+    return max(MANY, 6.0 * noise + 6.0) if noise else MANY
+
+
+def shifted(counts: NDArray[np.float64], noise: float) -> NDArray[np.float64]:
+    """What the logarithm is taken of, so that few counts bias it little: see
+    :meth:`torchpcct.scan.Scan.line_integrals`."""
+    more = noise**2 / 2.0 / np.maximum(counts, noise) if noise else 0.0
+    return np.maximum(counts + 0.5 + more, 0.5)
+
+
+@lru_cache(maxsize=16)
+def _log_bias(noise: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """ln m, and what the logarithm of Poisson counts, E ln(n + ½), lies above it."""
+    m = np.geomspace(fewest(noise), many(noise), 200)
+    mean = expected(m, noise, lambda n: np.log(shifted(n, noise)))
+    return np.log(m), mean - np.log(m)
+
+
+def log_bias(mean: Tensor, noise: float = 0.0) -> Tensor:
+    """Mean of ln(n + ½) less the logarithm of the mean, of Poisson counts n; with electronic noise
+    that of :func:`shifted` counts.
+
+    0.03 at two counts, 0.17 at one, 0.8 at ``FEWEST``: it takes the darkest rays for brighter than
+    they are. With a noise of four counts 0.1 at five, 0.36 at 2.4.
+
+    Args:
+        mean: expected counts, estimated from some ten readings (:func:`smoothed`). Above
+            :func:`many` the bias is 0; below :func:`fewest` it is that of so many, for the
+            estimate itself says no more.
+        noise: standard deviation of the electronics, in counts.
+    """
+    known, bias = _log_bias(noise)
+    least, most = fewest(noise), many(noise)
     # The logarithm of the estimate is biased, too: ½ a count in those that it was made of.
     m = mean + 0.5 / _AVERAGED
-    dim = m < MANY
-    found = np.interp(np.log(m[dim].double().clamp(FEWEST, MANY).numpy()), known, bias)
+    if noise:
+        m += 0.5 / _AVERAGED * noise**2 / mean.clamp(min=least)
+    if mean.device.type != "cpu":
+        return _of_table(m.clamp(min=least).log(), known, bias, math.log(most))
+    dim = m < most
+    found = np.interp(np.log(m[dim].double().clamp(least, most).numpy()), known, bias)
     return torch.zeros_like(mean).masked_scatter_(dim, torch.from_numpy(found).to(mean.dtype))
 
 

@@ -19,12 +19,12 @@ from torchpcct.devices import device_of, same_device
 from torchpcct.files import read_hdf5
 from torchpcct.geometry import ConeBeam, Geometry, VolumeGrid
 from torchpcct.readings import (
-    MANY,
     counted,
     interpolate_dead,
     inverse_variance,
     log_bias,
     logged,
+    many,
     smoothed,
 )
 from torchpcct.scan_file import scan_fields, write_scan
@@ -505,7 +505,7 @@ class Scan:
             ValueError: a noisy energy-integrating scan that does not hold ``quantum``.
         """
         p = self._logarithm()
-        if not (self.noise_free or self.logged) and self.electronic_noise == 0.0:
+        if not (self.noise_free or self.logged):
             self._unbias(p)
         p = self.linearisation.apply(p, self.window, overwrite=True)
         return p if self.dead is None else interpolate_dead(p, self.dead, self.geometry.has_rows)
@@ -513,8 +513,15 @@ class Scan:
     def _unbias(self, p: Tensor) -> None:
         """Add to ``p``, in place, what few counts leave of the logarithm's bias."""
         quanta = self.counts if self.quantum is None else self.counts / self.quantum
-        if float(quanta.amin()) < MANY:
-            p += log_bias(self._expected(quanta))
+        noise = self._noise_in_quanta()
+        if float(quanta.amin()) < many(noise):
+            p += log_bias(self._expected(quanta), noise)
+
+    def _noise_in_quanta(self) -> float:
+        """Electronic noise over the median reading of a quantum."""
+        if not self.electronic_noise or self.quantum is None:
+            return 0.0
+        return self.electronic_noise / float(self.quantum.median())
 
     def _expected(self, readings: Tensor) -> Tensor:
         """Expected readings: those of a known surround, or the mean over the neighbours of each."""

@@ -233,7 +233,8 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid, motion: Floats | None = N
     Raises:
         ValueError: a motion of another shape.
     """
-    from recon.analytic.water_unit import unit_warnings  # reconstructs, which imports this module
+    from recon.analytic.few_photons import bias_warnings  # reconstructs, which imports this module
+    from recon.analytic.water_unit import unit_warnings
     from torchpcct.checks.columns import column_test
     from torchpcct.checks.conjugate_rays import geometry_test  # loads scipy.stats
     from torchpcct.checks.moments import moment_test
@@ -295,7 +296,7 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid, motion: Floats | None = N
         found += moment_test(lines, geometry).findings
     if scan.unit == "HU" and lit:
         found += unit_warnings(lines, geometry, scan.linearisation.mu_ref)
-    return found
+    return [*found, *(bias_warnings(scan, lines, geometry) if lit else [])]
 
 
 def _at_rest(lines: Tensor, geometry: Any, about: tuple[float, float], motion: Floats) -> Tensor:

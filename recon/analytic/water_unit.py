@@ -124,16 +124,10 @@ def _plateau(p: Tensor, geometry: Geometry, mu_water: float, factor: float) -> f
         mu_water: mm⁻¹.
         factor: one of ``_UNITS``.
     """
-    lines, plane = _plane(p, geometry)
-    side = max(2, math.ceil(2.0 * plane.fov_radius / plane.cell))
-    whole = DetectorWindow.full(plane)
-    try:
-        weights = angular_weights(plane)
-    except ValueError:
+    image = row_image(p, geometry)
+    if image is None:
         return None
-    filtered = FilterPlan(plane, ("soft",), weights, whole, whole).forward(lines.unsqueeze(-2))
-    image = backproject(filtered[0, :, 0], plane, VolumeGrid((side, side), plane.cell))
-    density = np.maximum(image.numpy(), 0.0) / mu_water
+    density = np.maximum(image, 0.0) / mu_water
     total = float(density.sum())
     low, high = (bound / factor for bound in _SOFT[factor])
     solid = minimum_filter(density, _REACH, mode="constant") > 0.5 * density
@@ -143,6 +137,22 @@ def _plateau(p: Tensor, geometry: Geometry, mu_water: float, factor: float) -> f
     if factor > 1.0 and density[density > 0.5].sum() > _DENSE * total:
         return None
     return float(np.median(soft))
+
+
+def row_image(p: Tensor, geometry: Any) -> NDArray[np.float64] | None:
+    """A small image of the whole field of view from a row's line integrals ``(views, columns)``,
+    taken for those of a beam in its plane, mm⁻¹; None: a part of a turn is too short for it."""
+    lines, plane = _plane(p, geometry)
+    side = max(2, math.ceil(2.0 * plane.fov_radius / plane.cell))
+    whole = DetectorWindow.full(plane)
+    try:
+        weights = angular_weights(plane)
+    except ValueError:
+        return None
+    filtered = FilterPlan(plane, ("soft",), weights, whole, whole).forward(lines.unsqueeze(-2))
+    image = backproject(filtered[0, :, 0], plane, VolumeGrid((side, side), plane.cell))
+    found: NDArray[np.float64] = image.double().numpy()
+    return found
 
 
 def _plane(p: Tensor, geometry: Any) -> tuple[Tensor, ParallelBeam | FanBeam]:

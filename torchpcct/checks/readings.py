@@ -67,8 +67,8 @@ _LEAST_COLUMNS = 24
 _LEAST_VIEWS = 16
 """Views of a scan that is tested."""
 _AS_BEFORE = (
-    "give the readings as they were before, negative ones too, with dark= or electronic_noise=, or, "
-    "where those are lost, mask the whole shadow (dead=) or scan at a higher exposure"
+    "give the readings as they were before, negative ones too, with dark= or electronic_noise=, "
+    "or, where those are lost, mask the whole shadow (dead=) or scan at a higher exposure"
 )
 """What to do about negative readings that are none any more."""
 _MOST = 4_000_000

@@ -89,6 +89,20 @@ def test_the_logarithm_of_few_counts_is_not_biased():
     assert abs(water(reconstruct(scan, GRID, "fbp"))) < 30  # -75 HU
 
 
+@pytest.mark.parametrize("gain", [1.0, 60.0])
+@pytest.mark.parametrize(
+    ("noise", "means"), [(1.0, (1.0, 2.0, 5.0)), (4.0, (4.0, 7.0, 15.0)), (200.0, (180.0, 700.0))]
+)
+def test_nor_is_that_of_few_counts_with_electronic_noise(noise, means, gain):
+    """0.11 at seven counts over four of electronic noise, before."""
+    g = ParallelBeam(full_turn(60), 400, 1.0)
+    for mean in means:
+        rng = np.random.default_rng(3)
+        y = gain * (rng.poisson(mean, g.shape) + noise * rng.standard_normal(g.shape))
+        scan = Scan.from_counts(y, g, air=100.0 * mean * gain, gain=gain, electronic_noise=noise)
+        assert float(scan.line_integrals().mean()) == pytest.approx(math.log(100.0), abs=0.045)
+
+
 WRONG = {
     "an offset below both": (
         lambda: counted() + 2000.0,

@@ -1,0 +1,268 @@
+"""By how much are line integrals of few photons off on average? The logarithm of a noisy reading
+is not that of its mean.
+
+To second order ln(n + a) of Poisson counts n with mean m lies (a - ½) / m above ln m, with
+electronic noise σ another σ² / (2 m²) below. :meth:`torchpcct.scan.Scan.line_integrals` takes that
+off counts (:func:`torchpcct.readings.log_bias`); what is left is of rays that leave so few photons
+that their number is not known. Line integrals that another software made are as they are. Their
+noise tells what was done: the variance of exp(-p) grows by the signal u of a photon with its mean
+y, and is u (y - a u) where a photons were added before the logarithm was taken, u y + σ² u² where
+the electronics add noise (photon transfer, Janesick 2007).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
+from torch import Tensor
+
+from torchpcct.readings import (
+    MEDIAN_TO_SD,
+    expected,
+    fewest,
+    log_bias,
+    many,
+    shifted,
+    smoothed,
+)
+from torchpcct.scan import Scan
+
+__all__ = ["logarithm_error"]
+
+Floats = NDArray[np.float64]
+
+_AROUND = 7
+"""Views and columns over which readings are averaged for their mean."""
+_LEAST_MEAN = 0.02
+"""Photons to which the mean of so many is known at best."""
+_MOST_MEAN = 60.0
+"""Photons from which a logarithm is off by less than a hundredth, whatever was added."""
+_GROUPS = 8
+"""Groups of columns side by side, which share a bow-tie filter's part."""
+_CLASSES = 12
+"""Classes of brightness in which noise is looked at."""
+_FEWEST = 100
+"""Second differences of a class, at least."""
+_CLIPPED = 2.5
+"""Photons below which readings without any change the noise of logarithms."""
+_BEYOND = (-1.0, -0.5, 0.0, *(float(v) for v in np.geomspace(0.5, 2500.0, 25)))
+"""What the variance may be above the photons that are read: less, where one or half of one was
+added, more, where electronics add noise."""
+_SURE = 6.0
+"""χ² by which something else must fit better than photons without any change."""
+_COUNTED = 4.3
+"""Photons below which single ones are told in the readings."""
+_SEVERAL = 0.5
+"""Standard deviation of these readings, in photons, from which there are several of them."""
+_TOLD = 0.5
+"""Mean cosine of readings between whole photons from which they are told."""
+_SINGLE = 2.0
+"""Photons that a tenth of them does not exceed."""
+_CLEARLY = 0.2
+"""How much more it must be of whole photons than of halves, or less."""
+_NEARBY = np.linspace(0.9, 1.1, 41)
+"""Factors within which the noise tells the signal of a photon."""
+_MOST = 4000
+"""Readings of a group that are looked at for single photons."""
+_TRIMMED = 4.0
+"""Standard deviations beyond which a second difference is an edge."""
+
+
+class _Made(NamedTuple):
+    """How line integrals were made: of ``max(n + added + noise, floor)`` photons, each of which
+    ``signal (columns,)`` of air stands for; whether it is sure that nothing else was added."""
+
+    signal: Floats
+    added: float
+    noise: float
+    floor: float
+    sure: bool
+
+
+def logarithm_error(scan: Scan) -> tuple[Tensor, bool] | None:
+    """Mean error of a scan's line integrals that follows from their logarithms being those of few
+    photons, as far as it can be told.
+
+    Args:
+        scan: noisy, without window and energy bins.
+
+    Returns:
+        The shape of ``scan.counts``: how much too high line integrals are on average, and whether
+        its sign is known; None where no ray leaves so few photons that it matters.
+    """
+    if scan.noise_free or scan.window is not None:
+        return None
+    if scan.logged:
+        return _of_logarithms(scan)
+    quanta = scan.counts if scan.quantum is None else scan.counts / scan.quantum
+    noise = scan._noise_in_quanta()
+    if float(quanta.amin()) >= fewest(noise):
+        return None
+    mean = _mean_around(quanta, scan)
+    least = max(_LEAST_MEAN, noise / _AROUND)
+    known = np.geomspace(least, many(noise), 80)
+    bias = expected(known, noise, lambda n: np.log(shifted(n, noise))) - np.log(known)
+    z = np.linspace(-3.0, 3.0, 31)
+    weight = np.exp(-z * z / 2.0) / np.exp(-z * z / 2.0).sum()
+    estimate = known[:, None] + np.sqrt((known + noise**2) / 10.0)[:, None] * z
+    taken_off = log_bias(torch.from_numpy(estimate).clamp(min=0.0), noise).numpy() @ weight
+    found = np.interp(np.log(np.maximum(mean, least)), np.log(known), taken_off - bias)
+    return torch.from_numpy(found), True
+
+
+def _of_logarithms(scan: Scan) -> tuple[Tensor, bool] | None:
+    shone = torch.exp(-scan._logarithm())
+    if scan.dead is not None:
+        shone = shone.masked_fill(scan.dead, math.nan)
+    rows = scan.geometry.has_rows
+    y = (shone if rows or shone.ndim == 2 else shone.movedim(0, 1)).double()
+    made = _made(y.reshape(scan.geometry.views, -1, scan.geometry.columns).numpy())
+    if made is None:
+        return None
+    m = np.geomspace(_LEAST_MEAN, _MOST_MEAN + 6.0 * made.noise, 120)
+
+    def kept(n: Floats) -> Floats:
+        return np.maximum(n + made.added, made.floor)
+
+    level = expected(m, made.noise, kept)
+    error = np.log(m) - expected(m, made.noise, lambda n: np.log(kept(n)))
+    error[-1] = 0.0
+    mean = _mean_around(
+        torch.nan_to_num(shone, nan=1.0).double() / torch.from_numpy(made.signal), scan
+    )
+    return torch.from_numpy(np.interp(mean, level, error)), made.sure
+
+
+def _mean_around(values: Tensor, scan: Scan) -> Floats:
+    """Mean over the neighbouring views and columns, of what :func:`smoothed` leaves."""
+    smooth = smoothed(values.double(), scan.dead, scan.geometry.has_rows).numpy()
+    size = [1] * smooth.ndim
+    size[-1] = size[-3 if scan.geometry.has_rows else -2] = _AROUND
+    found: Floats = uniform_filter(smooth, size, mode="nearest")
+    return found
+
+
+def _made(y: Floats) -> _Made | None:
+    """How logarithms were made, by the noise of ``y = exp(-p)``, ``(views, rows, columns)``; None:
+    of so many photons that it does not matter, or it cannot be told."""
+    groups = np.array_split(np.arange(y.shape[-1]), max(1, min(_GROUPS, y.shape[-1] // 8)))
+    classes = [_transfer(y[..., columns]) for columns in groups]
+    if not all(level.size for level, _, _ in classes):
+        return None
+    fits = {beyond: _units(classes, beyond) for beyond in _BEYOND}
+    counted = {k: _counted(y, groups, fits[k][0], k == -0.5) for k in (0.0, -0.5, -1.0)}
+    told = max(counted, key=lambda k: counted[k][0])
+    alike = (-0.5,) if told == -0.5 else (-1.0, 0.0)
+    unlike = max(score for k, (score, _) in counted.items() if k not in alike)
+    if counted[told][0] > max(_TOLD, unlike + _CLEARLY):  # 0 or 1 were added, or a half
+        fits = {k: (counted[k][1], _misfit(classes, counted[k][1], k)) for k in alike}
+    beyond = min(fits, key=lambda k: fits[k][1])
+    others = [fit[1] for k, fit in fits.items() if k * beyond <= 0.0 and k != beyond]
+    sure = all(chi2 - fits[beyond][1] > _SURE for chi2 in others)
+    # Without a sign of more nothing was added.
+    beyond = beyond if sure else 0.0
+    units = fits[beyond][0]
+    signal = np.concatenate([np.full(c.size, u) for c, u in zip(groups, units, strict=True)])
+    lowest = float(np.nanmin(y / signal))
+    made = _Made(
+        signal, max(-beyond, 0.0), math.sqrt(max(beyond, 0.0)), min(max(lowest, 0.01), 1.0), sure
+    )
+    darkest = min(
+        float(level.min()) / unit for (level, _, _), unit in zip(classes, units, strict=True)
+    )
+    return made if darkest < _MOST_MEAN + 6.0 * made.noise else None
+
+
+def _counted(
+    y: Floats, groups: list[NDArray[np.int64]], units: Floats, half: bool
+) -> tuple[float, Floats]:
+    """How clearly the lowest readings are single photons, or ½, 1½, 2½ … of them (``half``), 0 to
+    1; and the signal of one in each group of columns, near ``units``."""
+    found, clear, count = np.array(units), 0.0, 0
+    for k, (columns, unit) in enumerate(zip(groups, units, strict=True)):
+        x = y[..., columns].ravel() / unit
+        x = x[(x > 0.3) & (x < _COUNTED)][:_MOST]
+        # A few photons more or less fit a longer or shorter step as well.
+        if x.size < _FEWEST or x.std() < _SEVERAL or np.quantile(x, 0.1) > _SINGLE:
+            continue
+        steps = np.cos(2.0 * math.pi * (x / _NEARBY[:, None] + 0.5 * half)).mean(1)
+        best = int(steps.argmax())
+        found[k] *= _NEARBY[best]
+        clear += x.size * float(steps[best])
+        count += x.size
+    return (clear / count if count else 0.0), found
+
+
+def _units(classes: list[tuple[Floats, Floats, Floats]], beyond: float) -> tuple[Floats, float]:
+    """The signal of a photon in each group of columns where the variance of ``m`` photons is ``m +
+    beyond``, and how badly that fits (χ²)."""
+    units = np.empty(len(classes))
+    for k, (level, variance, number) in enumerate(classes):
+        unit = float((variance * number).sum() / (level * number).sum())
+        for _ in range(40):
+            x = level / unit
+            clear = x > _CLIPPED
+            if clear.sum() < 2:
+                clear = x >= np.sort(x)[-2]
+            model = np.maximum(x + beyond, 0.2 * x)
+            weight = number / model**2 * clear
+            ratio = float((weight * model * variance).sum() / (weight * model**2).sum()) / unit**2
+            if abs(ratio - 1.0) < 1e-4:
+                break
+            unit *= ratio**0.5
+        units[k] = unit
+    return units, _misfit(classes, units, beyond)
+
+
+def _misfit(classes: list[tuple[Floats, Floats, Floats]], units: Floats, beyond: float) -> float:
+    """χ² of variances that should be those of ``m + beyond`` photons.
+
+    Second differences share readings: the relative variance of their mean square is 3.9 over
+    their number.
+    """
+    chi2 = 0.0
+    for (level, variance, number), unit in zip(classes, units, strict=True):
+        x = level / unit
+        model = np.maximum(x + beyond, 0.2 * x)
+        clear = x > _CLIPPED
+        chi2 += float((number / 3.9 * np.square(variance / (unit**2 * model) - 1.0))[clear].sum())
+    return chi2
+
+
+def _transfer(y: Floats) -> tuple[Floats, Floats, Floats]:
+    """Mean, variance and number of readings in classes of brightness, by second differences along
+    the views or the columns, whichever vary less."""
+    both = [_along(np.moveaxis(y, axis, -1)) for axis in (0, -1)]
+    known = [values for values in both if values[0].size]
+    if not known:
+        return (np.zeros(0),) * 3
+    return min(known, key=lambda v: float((v[1] / v[0]).mean()))
+
+
+def _along(y: Floats) -> tuple[Floats, Floats, Floats]:
+    second = y[..., 2:] - 2.0 * y[..., 1:-1] + y[..., :-2]
+    mean = (y[..., 2:] + y[..., 1:-1] + y[..., :-2]) / 3.0
+    known = np.isfinite(second) & (mean > 0.0)
+    second, mean = second[known], mean[known]
+    if second.size < _FEWEST:
+        return (np.zeros(0),) * 3
+    edges = np.quantile(mean, np.linspace(0.0, 1.0, _CLASSES + 1))
+    at = np.clip(np.searchsorted(edges, mean, "right") - 1, 0, _CLASSES - 1)
+    found = []
+    for k in range(_CLASSES):
+        d, m = second[at == k], mean[at == k]
+        if d.size < _FEWEST:
+            continue
+        # Given the sum of three readings of photons, its variance is exactly six times their mean.
+        ratio = d / np.sqrt(6.0 * m)
+        sd = MEDIAN_TO_SD * float(np.median(np.abs(ratio)))
+        inner = ratio[np.abs(ratio) <= _TRIMMED * max(sd, 1e-300)]
+        found.append((float(m.mean()), float(np.square(inner).mean() * m.mean()), float(d.size)))
+    level, variance, number = np.array(found).reshape(-1, 3).T
+    some = variance > 0.0
+    return level[some], variance[some], number[some]
