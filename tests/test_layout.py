@@ -9,6 +9,8 @@ import itertools
 from graphlib import TopologicalSorter
 from pathlib import Path
 
+from parsed import import_statements, parsed
+
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("torchpcct", "recon", "train")
 IMPORTERS = ("import_module", "__import__", "run_module")
@@ -29,10 +31,10 @@ def _imports(module):
     path = MODULES[module]
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     names = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in import_statements(path):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
+        else:
             above = (
                 package.split(".")[: len(package.split(".")) + 1 - node.level] if node.level else []
             )
@@ -76,7 +78,7 @@ def _named_in_texts(path):
     source = path.read_text(encoding="utf-8")
     if not any(name in source for name in IMPORTERS):
         return
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Call) and node.args:
             function, text = ast.unparse(node.func), node.args[0]
             if isinstance(text, ast.JoinedStr):

@@ -15,6 +15,7 @@ import yaml
 from fresh_python import run_python
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from parsed import import_statements
 
 ROOT = Path(__file__).parent.parent
 
@@ -178,11 +179,11 @@ def test_everything_imported_is_declared_with_a_floor_that_the_constraints_keep(
     declared = {canonicalize_name(r.name) for r in requirements}
     own = {"torchpcct", "recon", "train", "_typeshed"}  # the last has type checkers alone
     for path in (p for package in own for p in (ROOT / package).rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
-            names += (
-                [node.module or ""] if isinstance(node, ast.ImportFrom) and node.level == 0 else []
-            )
+        for node in import_statements(path):
+            if isinstance(node, ast.Import):
+                names = [a.name for a in node.names]
+            else:
+                names = [] if node.level else [node.module or ""]
             for top in {n.partition(".")[0] for n in names} - own - sys.stdlib_module_names:
                 assert canonicalize_name(MODULES.get(top, top)) in declared, (
                     f"{path}: {top} is not declared"

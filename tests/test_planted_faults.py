@@ -7,6 +7,7 @@ import importlib.util
 from pathlib import Path
 
 import pytest
+from parsed import parsed
 
 ROOT = Path(__file__).parent.parent
 _SPEC = importlib.util.spec_from_file_location("mutation", ROOT / "tests/bench/mutation.py")
@@ -24,8 +25,7 @@ def test_every_fault_can_be_planted_and_has_its_test(fault):
 
 @functools.cache
 def _functions_of(file):
-    tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
-    return {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+    return {node.name for node in parsed(ROOT / file).body if isinstance(node, ast.FunctionDef)}
 
 
 def test_faults_are_many_and_differ():

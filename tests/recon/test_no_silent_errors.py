@@ -302,16 +302,13 @@ def test_a_window_that_does_not_read_its_surround_is_named(clean, change, expect
         ]
         assert len(found) == bool(expected_text)
         assert not expected_text or expected_text in found[0]
-    # Noise of few counts, and readings that were lost, are no such thing.
-    few = clean.with_noise(0.02, 0)
+
+
+def test_few_counts_and_lost_readings_do_not_speak_against_the_surround(clean):
+    few, scan = clean.with_noise(0.02, 0), clean.with_noise(4.0, 0)
     lost = torch.rand(few.counts.shape, generator=torch.Generator().manual_seed(1)) < 0.1
-    for scan in (
-        few,
-        replace(
-            clean.with_noise(4.0, 0), counts=clean.with_noise(4.0, 0).counts.masked_fill(lost, 0.0)
-        ),
-    ):
-        assert not [t for t in consistency_warnings(scan, GRID) if "surround" in t]
+    for given in (few, replace(scan, counts=scan.counts.masked_fill(lost, 0.0))):
+        assert not [t for t in consistency_warnings(given, GRID) if "surround" in t]
 
 
 def _noise(sd):
