@@ -557,7 +557,7 @@ def _of_table(
     return torch.where(at < end, found, 0.0).to(at.dtype)
 
 
-def smoothed(values: Tensor, dead: Tensor | None, rows: bool) -> Tensor:
+def smoothed(values: Tensor, dead: Tensor | None, rows: bool, own: bool = True) -> Tensor:
     """Mean over the neighbourhood of every reading, the dead left out: an estimate of the expected
     readings.
 
@@ -569,15 +569,24 @@ def smoothed(values: Tensor, dead: Tensor | None, rows: bool) -> Tensor:
         values: ``(..., views, [rows,] columns)``.
         dead: bool of the same shape, or None.
         rows: whether the last axis but one is the detector's rows.
+        own: whether the reading itself is one of them. Without it the mean knows nothing of its
+            noise.
     """
     out = values.clone()
     share = None if dead is None else (~dead).to(values.dtype)
     if share is not None:
         out *= share
+    alone = None if own else (out.clone(), share)
     axes = ((-1, (1, 4, 6, 4, 1)), (-2, (1, 2, 1)), *(((-3, (1, 2, 1)),) if rows else ()))
     for axis, weights in axes:
         out = _filtered(out, axis, weights)
         share = None if share is None else _filtered(share, axis, weights)
+    if alone is not None:
+        middle = math.prod(max(weights) / sum(weights) for _, weights in axes)
+        out = out.sub_(alone[0], alpha=middle)
+        if share is None or alone[1] is None:
+            return out.div_(1.0 - middle)
+        share = share - middle * alone[1]
     return out if share is None else out / share.clamp(min=1e-6)
 
 

@@ -550,8 +550,9 @@ class Scan:
         ``counts``.
 
         Of expected readings, not of the noisy ones, which would bias a weighted fit: the readings'
-        local mean (:func:`torchpcct.readings.smoothed`); expectations of a noise-free scan as they
-        are. Dead readings weigh 0.
+        local mean (:func:`torchpcct.readings.smoothed`), where electronics add noise without the
+        reading itself, whose weight would follow its noise; expectations of a noise-free scan as
+        they are. Dead readings weigh 0.
 
         Raises:
             ValueError: an energy-integrating scan that does not hold ``quantum``.
@@ -561,7 +562,7 @@ class Scan:
         mean = (
             self.counts
             if self.noise_free or self.window is not None
-            else smoothed(self.counts, self.dead, rows)
+            else smoothed(self.counts, self.dead, rows, own=self.electronic_noise == 0.0)
         )
         quantum = self.counts.new_ones(1) if self.quantum is None else self.quantum
         p = (self._at_window(self.air) / torch.maximum(mean, quantum / 2)).log_()

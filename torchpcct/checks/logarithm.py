@@ -48,6 +48,12 @@ _CLASSES = 12
 """Classes of brightness in which noise is looked at."""
 _FEWEST = 100
 """Second differences of a class, at least."""
+_UNEVEN = 0.03
+"""Relative error of a variance that a beam leaves which is not even within a group."""
+_EDGES = 16.0
+"""χ² of a class from which it is of edges, and says nothing."""
+_FITS = 3.0
+"""χ² over the number of classes up to which it is noise that is looked at."""
 _CLIPPED = 2.5
 """Photons below which readings without any change the noise of logarithms."""
 _BEYOND = (-1.0, -0.5, 0.0, *(float(v) for v in np.geomspace(0.5, 2500.0, 25)))
@@ -163,7 +169,8 @@ def _made(y: Floats) -> _Made | None:
         fits = {k: (counted[k][1], _misfit(classes, counted[k][1], k)) for k in alike}
     beyond = min(fits, key=lambda k: fits[k][1])
     others = [fit[1] for k, fit in fits.items() if k * beyond <= 0.0 and k != beyond]
-    sure = all(chi2 - fits[beyond][1] > _SURE for chi2 in others)
+    fitting = fits[beyond][1] < _FITS * sum(len(level) for level, _, _ in classes)
+    sure = fitting and all(chi2 - fits[beyond][1] > _SURE for chi2 in others)
     # Without a sign of more nothing was added.
     beyond = beyond if sure else 0.0
     units = fits[beyond][0]
@@ -202,16 +209,16 @@ def _units(classes: list[tuple[Floats, Floats, Floats]], beyond: float) -> tuple
     """The signal of a photon in each group of columns where the variance of ``m`` photons is ``m +
     beyond``, and how badly that fits (χ²)."""
     units = np.empty(len(classes))
-    for k, (level, variance, number) in enumerate(classes):
-        unit = float((variance * number).sum() / (level * number).sum())
+    for k, (level, variance, _) in enumerate(classes):
+        unit = float(np.median(variance / level))
         for _ in range(40):
             x = level / unit
             clear = x > _CLIPPED
             if clear.sum() < 2:
                 clear = x >= np.sort(x)[-2]
             model = np.maximum(x + beyond, 0.2 * x)
-            weight = number / model**2 * clear
-            ratio = float((weight * model * variance).sum() / (weight * model**2).sum()) / unit**2
+            # Edges of the object are in some of the classes.
+            ratio = float(np.median((variance / model)[clear])) / unit**2
             if abs(ratio - 1.0) < 1e-4:
                 break
             unit *= ratio**0.5
@@ -230,7 +237,9 @@ def _misfit(classes: list[tuple[Floats, Floats, Floats]], units: Floats, beyond:
         x = level / unit
         model = np.maximum(x + beyond, 0.2 * x)
         clear = x > _CLIPPED
-        chi2 += float((number / 3.9 * np.square(variance / (unit**2 * model) - 1.0))[clear].sum())
+        error = 3.9 / number + _UNEVEN**2
+        off = np.square(variance / (unit**2 * model) - 1.0) / error
+        chi2 += float(np.minimum(off, _EDGES)[clear].sum())
     return chi2
 
 

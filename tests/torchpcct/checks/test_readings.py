@@ -103,6 +103,22 @@ def test_nor_is_that_of_few_counts_with_electronic_noise(noise, means, gain):
         assert float(scan.line_integrals().mean()) == pytest.approx(math.log(100.0), abs=0.045)
 
 
+@pytest.mark.parametrize("dead", [False, True])
+def test_weights_do_not_follow_electronic_noise(dead):
+    """Bright noise weighed more: 0.11 too low."""
+    g = ParallelBeam(full_turn(60), 400, 1.0)
+    rng = np.random.default_rng(8)
+    y = rng.poisson(8.0, g.shape) + 4.0 * rng.standard_normal(g.shape)
+    mask = rng.random(g.shape) < 0.05 * dead
+    scan = Scan.from_counts(y, g, air=800.0, electronic_noise=4.0, dead=mask)
+    p, w = scan.line_integrals(), scan.weights()
+    assert bool((w[torch.from_numpy(mask)] == 0.0).all())
+    mean = float((w * p).sum() / w.sum())
+    assert mean == pytest.approx(math.log(100.0), abs=0.04)
+    # As much in all as the variance says.
+    assert float(w[w > 0].mean()) == pytest.approx(8.0**2 / (8.0 + 16.0), rel=0.15)
+
+
 WRONG = {
     "an offset below both": (
         lambda: counted() + 2000.0,
