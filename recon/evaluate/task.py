@@ -138,7 +138,8 @@ class Task:
         tolerance_hu: effects of the scan below it are left out (:func:`torchpcct.acquire`).
 
     Raises:
-        ValueError: no such bodies, a signal that does not touch the inset, voxels too large for it.
+        ValueError: no such bodies, a signal that does not touch the inset, voxels too large for it,
+            ROIs of another grid.
     """
 
     name: str
@@ -185,6 +186,14 @@ class Task:
             raise ValueError(
                 f"task {self.name}: the inset must have cubic voxels (z, y, x), got {self.grid}"
             )
+        for roi, pair in self.rois.items():
+            for weights in pair:
+                if tuple(weights.shape) != tuple(self.grid.shape):
+                    raise ValueError(
+                        f"task {self.name}: the weights of ROI {roi!r} have the shape "
+                        f"{tuple(weights.shape)}, the inset {tuple(self.grid.shape)}: weights on "
+                        "another grid come with it, rois={} takes those that follow from the scene"
+                    )
         exposures = tuple(numbers("exposures_s", self.exposures_s, positive=True, unit="s"))
         for name, value in (
             ("signal", signal),
