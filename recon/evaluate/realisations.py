@@ -275,7 +275,7 @@ class Simulated:
             (found,) = network.solve(self.term)
         self.drawn, self.warned = (
             found.report.get("vessel", {}).get("drawn"),
-            bool(found.warnings),
+            bool(found.warnings or found.report["missing_body"]),
         )
         return found.volume
 

@@ -25,8 +25,15 @@ from recon.data_term import Quadratic
 from recon.mbir.known import Drawn, Known
 from recon.mbir.network import Network
 from recon.mbir.priors import Prior, name_of, network_of, prior_of
+from recon.mbir.residual import missing_body
 from recon.mbir.shown import contrast_note
-from recon.mbir.unrolled import DEFAULT_FIDELITY, Unrolled, fidelity_frequency, low_residual
+from recon.mbir.unrolled import (
+    DEFAULT_FIDELITY,
+    Unrolled,
+    fidelity_frequency,
+    low_pass,
+    low_residual,
+)
 from recon.mbir.weights_io import digest, read_tensors
 from recon.result import Result
 from torchpcct.geometry import VolumeGrid
@@ -193,13 +200,24 @@ class Mbir:
 
     @undisturbed
     def solve(self, term: Quadratic) -> list[Result]:
-        """Volumes in HU with their reports (:meth:`results`), the units of ``term`` as above. With
+        """Volumes in HU with their reports (:meth:`results`), the units of ``term`` as above, and
+        ``missing_body``: the ball that the data hold and the volume does not, by diameter_mm,
+        contrast_hu, deviations and voxel, or None (:func:`recon.mbir.residual.missing_body`). With
         something known, reports and warnings say what was drawn, or why not."""
         normal = self.normal(term)
         u, notes = self._solved(term, normal)
+        with torch.no_grad():
+            passed = low_pass(normal, torch.full_like(normal.unit_hu, self.fidelity))
+            missing = missing_body(normal, normal.left(u), 1.0 - passed)
+        found = zip(self.results(normal, u, normal.hu(u)), notes, missing, strict=True)
         return [
-            found._replace(report=found.report | note.report, warnings=note.warnings)
-            for found, note in zip(self.results(normal, u, normal.hu(u)), notes, strict=True)
+            result._replace(
+                report=result.report
+                | {"missing_body": None if body is None else body._asdict()}
+                | note.report,
+                warnings=note.warnings,
+            )
+            for result, note, body in found
         ]
 
     @torch.no_grad()

@@ -62,7 +62,8 @@ def reconstruct_mbir(
         ``noise_scale_hu`` (of a whole field where 10 and 90 % of the voxels lie), ``voxel_mm`` (of
         the grid that is worked on), ``weights_sha256`` or the name of the ``prior``, of noisy scans
         ``residual_p`` (:mod:`torchpcct.metrics.residual_test`: does the volume explain its data?),
-        ``warnings``; with something ``known``, under its name, whether it was drawn (``drawn``) or
+        ``missing_body`` of an inset (:func:`recon.mbir.residual.missing_body`), ``warnings``; with
+        something ``known``, under its name, whether it was drawn (``drawn``) or
         ``why`` not, and where it was, ``drawn_minus_plain_hu``, the difference from the volume
         without drawing, like the volume in HU.
 

@@ -14,19 +14,30 @@ what a small change of them does.
 
 Noise alone passes the first threshold in one of six billion coefficients. A pattern that fills a
 block is found while it is far too weak to be seen in a voxel, and from there on followed.
+
+A compact body is no pattern: it spreads over many coefficients. So the volume is also asked for the
+ball that it lacks most (:func:`missing_body`), by the matched filter ⟨t, β − H u⟩ over its noise
+(Barrett, Myers 2004, Foundations of Image Science, 13.2.12). It is not put back, as what stands out
+that far is denser than what the prior knows, and half of it comes back by that; it is said.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from recon.data_term import Quadratic
-from recon.mbir.frequencies import filtered, from_frequencies
+from recon.mbir.frequencies import (
+    filtered,
+    from_frequencies,
+    squared_frequencies,
+    to_frequencies,
+)
 
 _BLOCK = 16
 """Edge of a block in voxels: at 0.2 mm 3.2 mm, some periods of the finest lines."""
@@ -44,6 +55,35 @@ _REACH = 2
 """Blocks on either side that a pattern may go on in."""
 _AXES = (-3, -2, -1)
 """Of a volume."""
+_DIAMETERS = (2.0, 3.5, 5.0, 7.5)
+"""Of the balls, in voxels: beyond, the data decide themselves."""
+_STANDS_OUT = 6.0
+"""Standard deviations of noise from which a ball is missing: noise alone has five in one of a
+hundred insets, soft edges of sound vessels 5.4 at 2 s."""
+_LEAST_HU = 60.0
+"""And its contrast at least: at five times the dose the edges of sound vessels leave more than
+noise in the data, of which balls have up to 55 HU."""
+_MOST_NOISE = 1.5
+"""What is left of the data in most places is taken for noise up to so many times their noise:
+sound vessels have 1.34 at most. Beyond, it is what is missing."""
+_MEDIAN = 0.6745
+"""Median of the size of a normal variable, in standard deviations."""
+
+
+class MissingBody(NamedTuple):
+    """A ball that the data hold and a volume does not.
+
+    Attributes:
+        diameter_mm: of the ball.
+        contrast_hu: what is missing of its contrast.
+        deviations: that, in standard deviations of noise.
+        voxel: its place, (z, y, x) from 0.
+    """
+
+    diameter_mm: float
+    contrast_hu: float
+    deviations: float
+    voxel: tuple[int, int, int]
 
 
 def significant_residual(problem: Quadratic, spectrum: Tensor, u: Tensor, damping: float) -> Tensor:
@@ -68,6 +108,66 @@ def significant_residual(problem: Quadratic, spectrum: Tensor, u: Tensor, dampin
     window = along[0][:, None, None] * along[1][:, None] * along[2]
     noise = _noise(correlation, window)
     return torch.stack([_significant(v, window, n) for v, n in zip(step, noise, strict=True)])
+
+
+@torch.no_grad()
+def missing_body(problem: Quadratic, left: Tensor, kept: Tensor) -> list[MissingBody | None]:
+    """Of each volume the ball that it lacks most, None where none stands out of noise.
+
+    Args:
+        problem: normalised problem.
+        left: β − H u, ``(batch, z, y, x)``.
+        kept: how much of a frequency of β is left there where the prior has lost it, ``(batch, z,
+            y, x//2 + 1)``: a data consistency takes low ones away.
+    """
+    shape = left.shape[-3:]
+    f2 = squared_frequencies(shape, problem.voxel_mm, left)
+    spectrum = to_frequencies(left)
+    middle = torch.zeros_like(left)
+    middle[..., shape[0] // 2, shape[1] // 2, shape[2] // 2] = 1.0
+    at_middle = to_frequencies(middle)
+    found: list[MissingBody | None] = [None] * len(left)
+    for voxels in _DIAMETERS:
+        rim = math.ceil(voxels / 2.0) + 1
+        if 2 * rim >= min(shape):
+            continue
+        ball = _of_ball(f2, voxels * problem.voxel_mm)
+        template = from_frequencies(at_middle * ball, shape)
+        seen = from_frequencies(at_middle * ball * kept, shape)
+        # In the middle of the volume, with H itself; towards the rim both are smaller.
+        deviation = (seen * problem.apply(seen)).sum(_AXES).sqrt()
+        signal = (template * problem.apply(seen)).sum(_AXES)
+        inside = (slice(None), *(slice(rim, n - rim) for n in shape))
+        score = from_frequencies(spectrum * ball, shape)[inside]
+        # A prior that sharpens leaves more in the data than their noise.
+        typical = score.abs().flatten(1).median(1).values / _MEDIAN
+        unit = typical.clamp(deviation, _MOST_NOISE * deviation)
+        contrast = problem.unit_hu / (signal * (math.pi / 6.0) * voxels**3)
+        for k, own in enumerate(score):
+            at = int(own.abs().argmax())
+            z, y, x = (int(n) + rim for n in torch.unravel_index(torch.tensor(at), own.shape))
+            most = float(own.flatten()[at])
+            body = MissingBody(
+                voxels * problem.voxel_mm,
+                most * float(contrast[k]),
+                abs(most) / float(unit[k]),
+                (z, y, x),
+            )
+            before = found[k]
+            if before is None or body.deviations > before.deviations:
+                found[k] = body
+    return [
+        body
+        if body and body.deviations >= _STANDS_OUT and abs(body.contrast_hu) >= _LEAST_HU
+        else None
+        for body in found
+    ]
+
+
+def _of_ball(f2: Tensor, diameter: float) -> Tensor:
+    """Fourier transform of a ball at squared frequencies, 1 at 0."""
+    x = math.pi * diameter * f2.sqrt().clamp_min(1e-3 / diameter)
+    return 3.0 * (torch.sin(x) - x * torch.cos(x)) / x**3
 
 
 def _significant(step: Tensor, window: Tensor, noise: Tensor) -> Tensor:

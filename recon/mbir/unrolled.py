@@ -267,7 +267,7 @@ def guide_noise(
     return ((power * pairs).sum((-3, -2, -1)) / math.prod(shape)).sqrt()
 
 
-def _low_pass(problem: Quadratic, fidelities: Tensor) -> Tensor:
+def low_pass(problem: Quadratic, fidelities: Tensor) -> Tensor:
     """L on the frequencies of ``rfftn``, ``(batch, z, y, x//2 + 1)``."""
     cut = _CUTOFFS[0] + (_CUTOFFS[1] - _CUTOFFS[0]) * fidelities.reshape(-1, 1, 1, 1)
     f2 = squared_frequencies(problem.b.shape[-3:], problem.voxel_mm, problem.b)
@@ -283,8 +283,8 @@ def consistent(
 ) -> Tensor:
     """``v`` with its low frequencies replaced by the data's, ``(batch, z, y, x)``; ``fidelities``
     ``(batch,)`` in 0 … 1."""
-    low_pass = _low_pass(problem, fidelities).clamp_min(_LEAST)
-    hold = (spectrum + _TOWARDS) * (1.0 / low_pass - 1.0)
+    passed = low_pass(problem, fidelities).clamp_min(_LEAST)
+    hold = (spectrum + _TOWARDS) * (1.0 / passed - 1.0)
     inverse = 1.0 / (spectrum + hold)
     return v + conjugate_gradient(
         lambda w: problem.apply(w) + filtered(w, hold),
@@ -330,6 +330,6 @@ def low_residual(problem: Quadratic, left: Tensor, fidelity: float) -> Tensor:
         left: β − H u, ``(batch, z, y, x)``.
         fidelity: 0 … 1.
     """
-    low_pass = _low_pass(problem, torch.full_like(problem.unit_hu, fidelity))
-    sizes = [filtered(v, low_pass).flatten(1).norm(dim=1) for v in (left, problem.b)]
+    passed = low_pass(problem, torch.full_like(problem.unit_hu, fidelity))
+    sizes = [filtered(v, passed).flatten(1).norm(dim=1) for v in (left, problem.b)]
     return sizes[0] / sizes[1].clamp_min(torch.finfo(sizes[1].dtype).tiny)

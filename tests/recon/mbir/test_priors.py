@@ -296,6 +296,26 @@ def test_a_filter_knows_any_noise_and_says_that_it_is_the_prior(clean, problem):
     assert torch.equal(other.data, volume.data)
 
 
+def test_a_prior_that_loses_a_body_is_told_of_it(clean, problem):
+    """What the data hold and the volume does not is said with its place, and is in the report; of
+    a prior that gives back what it is shown nothing is."""
+    scan = clean.with_noise(2.0, 0)
+
+    def volume(prior):
+        network = Mbir(Unrolled(prior, 1, voxel_mm=VOXEL, bilateral=False))
+        return reconstruct(scan, GRID, "mbir", network=network, problem=problem)
+
+    lost = volume(lambda estimate, *_: 0.0 * estimate)
+    body = lost.report["missing_body"]
+    (text,) = (w for w in lost.report["warnings"] if "more than the volume shows" in w)
+    place = [axis[n] for axis, n in zip(GRID.axes, body["voxel"], strict=True)]
+    assert f"at z, y, x = {place[0]:.1f}, {place[1]:.1f}, {place[2]:.1f} mm" in text
+    assert f"{abs(body['contrast_hu']):.0f} HU" in text
+    whole = volume(lambda estimate, towards, *_: towards)
+    assert whole.report["missing_body"] is None
+    assert not any("more than the volume shows" in w for w in whole.report["warnings"])
+
+
 # --- weights of another network -------------------------------------------------------------------
 
 

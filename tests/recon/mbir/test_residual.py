@@ -11,7 +11,7 @@ from inset_operators import HU, problem
 from recon.data_term import Quadratic
 from recon.gram.gram import Gram
 from recon.mbir.frequencies import filtered
-from recon.mbir.residual import significant_residual
+from recon.mbir.residual import MissingBody, missing_body, significant_residual
 
 DAMPING = 0.1
 SHAPE = (18, 24, 24)
@@ -101,6 +101,70 @@ def test_slices_smaller_than_a_block_hold_no_pattern():
     A, w = problem(shape=(18, 12, 24), rows=20)
     p = left(Gram(A, w, nodes=1), bars((18, 12, 24), 5000.0), 0.0)
     assert not found(p).any()
+
+
+BALL_MM = 1.4
+"""Diameter of the ball that is missing: one of those that are looked for."""
+BALL_VOXEL = (8, 13, 11)
+
+
+def ball(shape=SHAPE, voxel=0.4, middle=BALL_VOXEL):
+    """How much of each voxel lies in it, from 8³ points."""
+    at = [(torch.arange(8 * n) + 0.5) / 8 - 0.5 - m for n, m in zip(shape, middle, strict=True)]
+    squares = [(voxel * a).square() for a in at]
+    near = squares[0][:, None, None] + squares[1][:, None] + squares[2] < (BALL_MM / 2) ** 2
+    return torch.nn.functional.avg_pool3d(near.float()[None], 8)[0]
+
+
+def missed(p, u=None) -> list[MissingBody | None]:
+    return missing_body(p, p.left(torch.zeros_like(p.b) if u is None else u), torch.tensor(1.0))
+
+
+def striking_hu(gram, deviations):
+    """Contrast of the ball that stands out of the noise of :func:`left` by so much."""
+    x = ball() * HU
+    return deviations / float((x * gram.apply(x)).sum().sqrt())
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_body_that_is_missing_is_found_where_it_is(gram, sign):
+    hu = sign * striking_hu(gram, 15.0)
+    (body,) = missed(left(gram, ball() * hu, 1.0))
+    assert body is not None
+    assert max(abs(a - b) for a, b in zip(body.voxel, BALL_VOXEL, strict=True)) <= 1
+    assert body.diameter_mm == pytest.approx(BALL_MM)
+    assert 9.0 < body.deviations < 18.0
+    assert body.contrast_hu == pytest.approx(hu, rel=0.2)
+
+
+def test_no_body_is_missing_in_noise(gram):
+    assert not any(missed(left(gram, torch.zeros(SHAPE), 1.0, batch=200)))
+
+
+def test_a_body_that_the_volume_shows_is_not_missing(gram):
+    hu = striking_hu(gram, 40.0)
+    p = left(gram, ball() * hu, 1.0)
+    assert missed(p, (ball() * hu / float(p.unit_hu))[None]) == [None]
+    # a third of it is missed
+    (body,) = missed(p, (ball() * hu / 1.5 / float(p.unit_hu))[None])
+    assert body is not None
+    assert body.contrast_hu == pytest.approx(hu / 3, rel=0.35)
+
+
+def test_what_little_contrast_lacks_is_not_said(gram):
+    """At a high dose every edge leaves more than noise in the data."""
+    for hu, is_said in ((30.0, False), (120.0, True)):
+        dose = (striking_hu(gram, 20.0) / hu) ** 2
+        b = dose * gram.apply(ball() * hu * HU)[None]
+        p = Quadratic(gram, b, torch.full((1,), dose), (0.4,) * 3, 1000 * HU).in_noise_units()
+        (body,) = missed(p)
+        assert (body is not None) is is_said
+
+
+def test_thin_and_small_volumes_are_not_searched():
+    A, w = problem(shape=(4, 10, 10), rows=6)
+    p = left(Gram(A, w, nodes=1), torch.full((4, 10, 10), 900.0), 1.0)
+    assert missed(p) == [None]
 
 
 def test_it_is_differentiable(gram):
