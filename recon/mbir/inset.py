@@ -18,7 +18,6 @@ from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.scan_memory import once
 from torchpcct.typing import JsonObject
-from torchpcct.volume import in_words
 
 FARTHEST_CELL = 4.0
 """Detector cells at the axis may be so many times as large, or as small, as the network's
@@ -78,7 +77,7 @@ class Inset:
             warnings = [
                 *before,
                 *network.check(report["noise_scale_hu"], peak, scan.unit, problem.mu_ref),
-                *self._missing(report["missing_body"], scan),
+                *self._missing(report["missing_body"]),
             ]
             tests = []
             if not scan.noise_free:
@@ -93,16 +92,14 @@ class Inset:
             found.append(Result(self._onto_grid(volume), report, warnings, tests))
         return found
 
-    def _missing(self, body: JsonObject | None, scan: Scan) -> list[str]:
+    def _missing(self, body: JsonObject | None) -> list[str]:
         """What the data hold and the volume does not, where that is no noise."""
         if body is None:
             return []
-        place = [axis[at] for axis, at in zip(self._work.axes, body["voxel"], strict=True)]
-        contrast = in_words(abs(body["contrast_hu"]), scan.unit, self.problem.mu_ref)
-        z, y, x = place
+        z, y, x = (axis[at] for axis, at in zip(self._work.axes, body["voxel"], strict=True))
         return [
             f"the data hold more than the volume shows: at z, y, x = {z:.1f}, {y:.1f}, {x:.1f} mm "
-            f"a body of about {body['diameter_mm']:.1f} mm should be {contrast} "
+            f"a body of about {body['diameter_mm']:.1f} mm should be "
             f"{'brighter' if body['contrast_hu'] > 0 else 'darker'} "
             f"({body['deviations']:.1f} standard deviations of noise); the prior has lost it, or "
             'part of it: look there in "fbp" or "pwls"'

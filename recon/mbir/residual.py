@@ -75,7 +75,8 @@ class MissingBody(NamedTuple):
 
     Attributes:
         diameter_mm: of the ball.
-        contrast_hu: what is missing of its contrast.
+        contrast_hu: what is missing of its contrast, if it is a ball: of a thread or an edge it is
+            up to three times too much.
         deviations: that, in standard deviations of noise.
         voxel: its place, (z, y, x) from 0.
     """

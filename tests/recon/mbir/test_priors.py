@@ -310,7 +310,7 @@ def test_a_prior_that_loses_a_body_is_told_of_it(clean, problem):
     (text,) = (w for w in lost.report["warnings"] if "more than the volume shows" in w)
     place = [axis[n] for axis, n in zip(GRID.axes, body["voxel"], strict=True)]
     assert f"at z, y, x = {place[0]:.1f}, {place[1]:.1f}, {place[2]:.1f} mm" in text
-    assert f"{abs(body['contrast_hu']):.0f} HU" in text
+    assert ("brighter" in text) is (body["contrast_hu"] > 0)
     whole = volume(lambda estimate, towards, *_: towards)
     assert whole.report["missing_body"] is None
     assert not any("more than the volume shows" in w for w in whole.report["warnings"])
