@@ -55,8 +55,9 @@ _REACH = 2
 """Blocks on either side that a pattern may go on in."""
 _AXES = (-3, -2, -1)
 """Of a volume."""
-_DIAMETERS = (2.0, 3.5, 5.0, 7.5)
-"""Of the balls, in voxels: beyond, the data decide themselves."""
+_DIAMETERS = (3.5, 5.0, 7.5)
+"""Of the balls, in voxels: below, the data of an edge differ from those of its voxels by as much;
+beyond, the data decide themselves."""
 _STANDS_OUT = 6.0
 """Standard deviations of noise from which a ball is missing: noise alone has five in one of a
 hundred insets, soft edges of sound vessels 5.4 at 2 s."""
