@@ -229,7 +229,9 @@ def test_your_own_data_runs(tmp_path):
 
 @pytest.mark.extended
 def test_benchmark_runs(tmp_path):
-    notebook = run("fbp_vs_mbir.ipynb", tmp_path, 3600)
+    inset = "rois={}, grid=type(task.grid)((27, 31, 31), 0.2, task.grid.center)"
+    smaller = (("presets.pcct(views=246)", f"presets.pcct(views=123), {inset}"),)
+    notebook = run("fbp_vs_mbir.ipynb", tmp_path, 3600, smaller)
     assert len(pictures(notebook)) == 3
     text = "\n".join(o.data.get("text/markdown", "") for o in outputs(notebook) if "data" in o)
     assert "The Cramér–Rao bound" in text
@@ -237,7 +239,8 @@ def test_benchmark_runs(tmp_path):
 
 @pytest.mark.extended
 def test_reading_a_plaque_runs(tmp_path):
-    notebook = run("reading_a_plaque.ipynb", tmp_path, 1800)
+    smaller = (("(51, 45, 45)", "(31, 41, 41)"), ("4.5), 25", "4.5), 15"))
+    notebook = run("reading_a_plaque.ipynb", tmp_path, 1800, smaller)
     (text,) = (
         o.data["text/markdown"] for o in outputs(notebook) if "text/markdown" in o.get("data", {})
     )
