@@ -123,7 +123,10 @@ def energy_rows(
             )
             for w in (ones, weights)
         )
-        change = _per_mm(lines - decompose_scan(other, model).line_integrals, path)
+        # Rays beside the body read the same in both scans.
+        through = path > 0.0
+        there = decompose_scan(other, model, readings=through).line_integrals
+        change = _per_mm(lines[:, through] - there, path[through])
         curve = vmi_curve(change, np.zeros(2), noise[k, k], model.basis)
         limit, energies = (
             float(weighting_gain(scanner, (first, second), behind, kind)[seen].mean())
@@ -162,9 +165,9 @@ def _differences(task: Task, pairs: Sequence[tuple[str, str]]) -> list[Tensor]:
 
 
 def _per_mm(change: Tensor, path: Tensor) -> Floats:
-    """Least squares for what readings ``(..., views, rows, columns)`` change by per mm of path."""
+    """Least squares for what readings ``(..., *path.shape)`` change by per mm of path."""
     p = path.double()
-    return ((change.double() * p).sum((-3, -2, -1)) / p.square().sum()).numpy()
+    return ((change.double() * p).flatten(-p.ndim).sum(-1) / p.square().sum()).numpy()
 
 
 def _signal_to_noise(

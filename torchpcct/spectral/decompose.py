@@ -258,8 +258,11 @@ def cramer_rao(
 
 
 @checked
-def decompose_scan(scan: Scan, model: SpectralModel, **options: Any) -> Decomposition:
-    """:func:`decompose` of all readings of a spectral scan, ``(2, views, rows, columns)``.
+def decompose_scan(
+    scan: Scan, model: SpectralModel, *, readings: Tensor | None = None, **options: Any
+) -> Decomposition:
+    """:func:`decompose` of all readings of a spectral scan, ``(2, views, rows, columns)``; or of
+    those chosen by ``readings``, bool ``(views, rows, columns)``: ``(2, chosen)``.
 
     Noise-free scans are decomposed without bias reduction and to ``EXACT_TOLERANCE`` unless
     ``options`` say otherwise.
@@ -270,7 +273,11 @@ def decompose_scan(scan: Scan, model: SpectralModel, **options: Any) -> Decompos
     _check_spectral(scan)
     columns, scale = model.cells(scan)
     exact = {"bias_reduction": False, "tolerance": EXACT_TOLERANCE} if scan.noise_free else {}
-    return decompose(scan.counts, model, columns=columns, scale=scale, **{**exact, **options})
+    counts = scan.counts
+    if readings is not None:
+        columns, scale = (v.broadcast_to(readings.shape)[readings] for v in (columns, scale))
+        counts = counts[:, readings]
+    return decompose(counts, model, columns=columns, scale=scale, **{**exact, **options})
 
 
 @checked

@@ -224,6 +224,10 @@ def test_windowed_scan():
     model = SpectralModel.of(scanner, 0.35)
     found = decompose_scan(scan, model)
     assert found.line_integrals.shape == (2, *scan.counts.shape[1:])
+    # Of some readings each is decomposed at its own cell.
+    some = torch.rand(scan.counts.shape[1:], generator=torch.Generator().manual_seed(0)) < 0.1
+    chosen = decompose_scan(scan, model, readings=some).line_integrals
+    assert torch.equal(chosen, found.line_integrals[:, some])
     around = decompose_surround(scan, model)
     assert around.shape == (2, 2, 400)
     assert float(around[0, 0, 200]) == pytest.approx(40, abs=0.05)
