@@ -58,12 +58,12 @@ _AXES = (-3, -2, -1)
 _DIAMETERS = (3.5, 5.0, 7.5)
 """Of the balls, in voxels: below, the data of an edge differ from those of its voxels by as much;
 beyond, the data decide themselves."""
-_STANDS_OUT = 6.0
+_STANDS_OUT = 7.0
 """Standard deviations of noise from which a ball is missing: noise alone has five in one of a
-hundred insets, soft edges of sound vessels 5.4 at 2 s."""
-_LEAST_HU = 60.0
-"""And its contrast at least: at five times the dose the edges of sound vessels leave more than
-noise in the data, of which balls have up to 55 HU."""
+hundred insets, edges of sound vessels have 5.4 at 2 s."""
+_LEAST_NOISE_HU = 40.0
+"""Standard deviation of the smallest ball's contrast below which no ball is asked for: what sharp
+edges leave in the data of voxels, up to 200 HU at the end of a lumen, stands out of less noise."""
 _MOST_NOISE = 1.5
 """What is left of the data in most places is taken for noise up to so many times their noise:
 sound vessels have 1.34 at most. Beyond, it is what is missing."""
@@ -114,7 +114,8 @@ def significant_residual(problem: Quadratic, spectrum: Tensor, u: Tensor, dampin
 
 @torch.no_grad()
 def missing_body(problem: Quadratic, left: Tensor, kept: Tensor) -> list[MissingBody | None]:
-    """Of each volume the ball that it lacks most, None where none stands out of noise.
+    """Of each volume the ball that it lacks most, None where none stands out of noise, or where
+    there is so little noise that edges do.
 
     Args:
         problem: normalised problem.
@@ -129,6 +130,7 @@ def missing_body(problem: Quadratic, left: Tensor, kept: Tensor) -> list[Missing
     middle[..., shape[0] // 2, shape[1] // 2, shape[2] // 2] = 1.0
     at_middle = to_frequencies(middle)
     found: list[MissingBody | None] = [None] * len(left)
+    noise_hu: list[float] = []
     for voxels in _DIAMETERS:
         rim = math.ceil(voxels / 2.0) + 1
         if 2 * rim >= min(shape):
@@ -143,8 +145,11 @@ def missing_body(problem: Quadratic, left: Tensor, kept: Tensor) -> list[Missing
         score = from_frequencies(spectrum * ball, shape)[inside]
         # A prior that sharpens leaves more in the data than their noise.
         typical = score.abs().flatten(1).median(1).values / _MEDIAN
-        unit = typical.clamp(deviation, _MOST_NOISE * deviation)
+        unit = typical.clamp(deviation, _MOST_NOISE * deviation).clamp_min(
+            torch.finfo(typical.dtype).tiny
+        )
         contrast = problem.unit_hu / (signal * (math.pi / 6.0) * voxels**3)
+        noise_hu = noise_hu or (deviation * contrast).tolist()
         for k, own in enumerate(score):
             at = int(own.abs().argmax())
             z, y, x = (int(n) + rim for n in torch.unravel_index(torch.tensor(at), own.shape))
@@ -159,10 +164,8 @@ def missing_body(problem: Quadratic, left: Tensor, kept: Tensor) -> list[Missing
             if before is None or body.deviations > before.deviations:
                 found[k] = body
     return [
-        body
-        if body and body.deviations >= _STANDS_OUT and abs(body.contrast_hu) >= _LEAST_HU
-        else None
-        for body in found
+        body if body and body.deviations >= _STANDS_OUT and noise >= _LEAST_NOISE_HU else None
+        for body, noise in zip(found, noise_hu or [0.0] * len(left), strict=True)
     ]
 
 

@@ -19,6 +19,7 @@ from recon.mbir.field import blockwise
 from recon.mbir.mbir import WEIGHTS_FORMAT, Mbir
 from recon.mbir.network import Network, NetworkConfig, bilateral_prior
 from recon.mbir.priors import PlugAndPlay, name_of, network_of, prior_of
+from recon.mbir.residual import MissingBody
 from recon.mbir.unrolled import Unrolled, first_views, guide_noise
 from recon.mbir.weights_io import write_tensors
 from torchpcct import Volume, VolumeGrid
@@ -296,24 +297,19 @@ def test_a_filter_knows_any_noise_and_says_that_it_is_the_prior(clean, problem):
     assert torch.equal(other.data, volume.data)
 
 
-def test_a_prior_that_loses_a_body_is_told_of_it(clean, problem):
-    """What the data hold and the volume does not is said with its place, and is in the report; of
-    a prior that gives back what it is shown nothing is."""
-    scan = clean.with_noise(2.0, 0)
-
-    def volume(prior):
-        network = Mbir(Unrolled(prior, 1, voxel_mm=VOXEL, bilateral=False))
-        return reconstruct(scan, GRID, "mbir", network=network, problem=problem)
-
-    lost = volume(lambda estimate, *_: 0.0 * estimate)
-    body = lost.report["missing_body"]
-    (text,) = (w for w in lost.report["warnings"] if "more than the volume shows" in w)
-    place = [axis[n] for axis, n in zip(GRID.axes, body["voxel"], strict=True)]
-    assert f"at z, y, x = {place[0]:.1f}, {place[1]:.1f}, {place[2]:.1f} mm" in text
-    assert ("brighter" in text) is (body["contrast_hu"] > 0)
-    whole = volume(lambda estimate, towards, *_: towards)
-    assert whole.report["missing_body"] is None
-    assert not any("more than the volume shows" in w for w in whole.report["warnings"])
+@pytest.mark.parametrize(("contrast_hu", "word"), [(90.0, "brighter"), (-90.0, "darker")])
+def test_a_body_that_the_volume_lacks_is_said_with_its_place(
+    clean, problem, monkeypatch, contrast_hu, word
+):
+    body = MissingBody(0.7, contrast_hu, 8.2, (4, 9, 12))
+    monkeypatch.setattr("recon.mbir.mbir.missing_body", lambda *_: [body])
+    network = Mbir(Unrolled(half, voxel_mm=VOXEL))
+    volume = reconstruct(clean.with_noise(2.0, 0), GRID, "mbir", network=network, problem=problem)
+    assert volume.report["missing_body"] == body._asdict()
+    (text,) = (w for w in volume.report["warnings"] if "more than the volume shows" in w)
+    z, y, x = (axis[n] for axis, n in zip(GRID.axes, body.voxel, strict=True))
+    assert f"at z, y, x = {z:.1f}, {y:.1f}, {x:.1f} mm a body of about 0.7 mm" in text
+    assert f"{word} (8.2 standard deviations of noise)" in text
 
 
 # --- weights of another network -------------------------------------------------------------------
