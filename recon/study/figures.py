@@ -72,7 +72,7 @@ def curve_axes(x_label: str, y_labels: Sequence[str]) -> tuple[Figure, NDArray[n
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.0 * len(y_labels), 3.8), dpi=130, layout="constrained")
-    axes = figure.subplots(1, len(y_labels))
+    axes = figure.subplots(1, len(y_labels), squeeze=False)[0]
     for ax, label in zip(axes, y_labels, strict=True):
         ax.set_xlabel(x_label)
         ax.set_ylabel(label)

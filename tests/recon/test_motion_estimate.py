@@ -13,8 +13,9 @@ import recon
 from recon.analytic.coverage import _at_rest, consistency_warnings
 from recon.analytic.inset import InsetFbp, view_motion
 from recon.least_squares.inset_problem import InsetProblem
-from recon.motion import _basis, _believed, _Problem, estimate_motion
+from recon.motion import _basis, _believed, _likelihood, _Problem, estimate_motion
 from recon.study.motion_found import Jump
+from recon.study.paths import KINDS, true_path
 from recon.variable_projection import Normal
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, acquire, full_turn
 from torchpcct.geometry import project_points
@@ -199,6 +200,29 @@ def test_what_the_readings_leave_open_stays_open():
         off = found.mean.T.ravel() - truth
         inside.append(np.abs(off) <= 2.0 * np.sqrt(np.diag(found.covariance)))
     assert 0.9 < np.mean(inside) < 0.995
+
+
+@pytest.mark.extended
+def test_loops_are_covered(moving):
+    """Drawn in the equations of one scan, whose noise they have: 95 % within two errors, of all
+    together."""
+    problem = _Problem(moving.with_noise(EXPOSURE_S, 0), GRID, None)
+    at = np.linalg.lstsq(problem.basis, _truth(moving)[1], rcond=None)[0]
+    seen = problem.at(at)[0]
+    precision = _likelihood(seen, at, problem.inflation)[0]
+    rng = np.random.default_rng(0)
+    noise = np.linalg.cholesky(precision + 1e-9 * np.trace(precision) * np.eye(len(precision)))
+    inside, off = [], []
+    for _ in range(60):
+        path = true_path(KINDS["loops"](rng), moving)
+        pull = precision @ np.linalg.lstsq(problem.basis, path, rcond=None)[0].T.ravel()
+        pull += noise @ rng.standard_normal(len(pull))
+        found = _believed(Normal(precision, pull, precision, 1.0), 0.0 * at, 1.0)
+        errors = problem.errors(found.covariance)
+        off.append((problem.path(found.mean) - path) / errors)
+        inside.append(np.mean(np.abs(off[-1]) <= 2.0))
+    assert 0.9 < np.mean(inside) < 0.99
+    assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.1
 
 
 def test_a_jump_is_told_from_a_smooth_path():

@@ -78,6 +78,7 @@ def test_report(tiny, tmp_path):
     assert len(data["compensated"]) == 12
     found = data["found"][0]
     assert found["held"] == 1
+    assert found["jumps"] == 0
     assert found["error_mm"] < 0.2 * found["true_mm"]
     first = data["residual"][0]["in_place"]
     here = study.measured.seen.residual["PCCT", 0.2][0]
