@@ -104,11 +104,11 @@ def _tensor(name: str, values: object) -> Tensor:
         TypeError: no array of real numbers.
     """
     if isinstance(values, Tensor):
-        if values.is_complex():
+        if values.is_complex() or values.dtype == torch.bool:
             raise TypeError(f"{name} must be real numbers, got {values.dtype}")
         return values.detach().to("cpu", torch.float32)
     array = np.asarray(values)
-    if array.dtype.kind not in "biuf":
+    if array.dtype.kind not in "iuf":  # bool is a mask, and no reading
         raise TypeError(
             f"{name} must be an array of real numbers, got {type(values).__name__} of {array.dtype}"
         )

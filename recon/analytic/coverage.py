@@ -290,13 +290,15 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid, motion: Floats | None = N
     sides = cut_off(lines, geometry, weights)
     # What rays without light read is not what they pass: of that other tests say nothing.
     lit = scan.logged or not without_light(scan)
+    few = bias_warnings(scan, lines, geometry) if lit else []
+    lit = lit and (scan.logged or not few)
     if any(sides):
         found.append(_cut_text(lines, sides))
     elif lit and len(found) == len(columns) + len(unmeasured) and not is_offset(geometry):
         found += moment_test(lines, geometry).findings
     if scan.unit == "HU" and lit:
         found += unit_warnings(lines, geometry, scan.linearisation.mu_ref)
-    return [*found, *(bias_warnings(scan, lines, geometry) if lit else [])]
+    return [*found, *few]
 
 
 def _at_rest(lines: Tensor, geometry: Any, about: tuple[float, float], motion: Floats) -> Tensor:

@@ -42,6 +42,7 @@ from torchpcct.checks.conjugate_rays import geometry_test
 from torchpcct.checks.defects import repair_defects
 from torchpcct.checks.readings import reading_warnings
 from torchpcct.geometry import ConeBeam, VolumeGrid
+from torchpcct.readings import fewest
 
 
 def alarms(drawn: Drawn, method: str | None = None) -> list[str]:
@@ -115,11 +116,12 @@ def dimmed(drawn: Drawn, photons: tuple[float, float]) -> Drawn:
     """The same scan with photons a reading in air drawn anew, between two numbers."""
     low, high = (math.log(bound) for bound in photons)
     rng = np.random.default_rng([drawn.seed, 4])
-    return replace(
-        drawn,
-        photons=math.exp(rng.uniform(low, high)),
-        rightly=(*drawn.rightly, "photons a reading: how dark"),
-    )
+    dim = replace(drawn, photons=math.exp(rng.uniform(low, high)))
+    rightly = [*drawn.rightly, "photons a reading: how dark"]
+    shone = transmissions(dim.geometry, dim.solids, **dim.options)
+    if float((dim.photons * dim.profile * shone).min()) < 2.0 * fewest(dim.electronic_noise):
+        rightly.append("that their number is not known")
+    return replace(dim, rightly=tuple(rightly))
 
 
 CAUSES = ("centre", "scale", "step", "roll")

@@ -464,8 +464,11 @@ def _mismatch(pairs: RayPairs, false_alarms: float) -> tuple[float, int]:
         return v - torch.where(pairs.known, v, 0.0).sum(0) / seen
 
     changing = [change(pairs.here), change(pairs.conjugate)]
-    different, stray, *changed = _blocks(
-        np.stack([product(v, pairs.known) for v in (pairs.difference, between, *changing)]), used
+    # Columns at other places sample a thin wall otherwise: of what is round about the axis all
+    # views do so alike, and nothing of the object tells them apart.
+    compared = (pairs.difference, change(pairs.difference), between, *changing)
+    different, apart, stray, *changed = _blocks(
+        np.stack([product(v, pairs.known) for v in compared]), used
     )
     signal = changed[0] + changed[1]
     if signal.sum() <= 0:
@@ -478,7 +481,10 @@ def _mismatch(pairs: RayPairs, false_alarms: float) -> tuple[float, int]:
     def beyond(value: Floats, limit: float) -> bool:
         return _above(value - limit * signal - pairs.parted / signal.size) < false_alarms / 3
 
-    grade = sum(beyond(different, max(limit, 2.0 * sampled)) for limit in (_DIFFER, _STRANGERS))
+    grade = sum(
+        all(beyond(value, max(limit, 2.0 * sampled)) for value in (different, apart))
+        for limit in (_DIFFER, _STRANGERS)
+    )
     # Views that their neighbours do not foretell, in steps that they should: out of order.
     if not grade and view_step(pairs.rays.geometry.angles) < _FINE_STEP_RAD:
         grade = 2 * (beyond(different, _STRANGERS) and beyond(stray, _STRANGERS))

@@ -40,6 +40,8 @@ _AROUND = 7
 """Views and columns over which readings are averaged for their mean."""
 _LEAST_MEAN = 0.02
 """Photons to which the mean of so many is known at best."""
+_UNKNOWN = 2.0
+"""Mean over the fewest photons that the logarithm is corrected of, below which it is not known."""
 _MOST_MEAN = 60.0
 """Photons from which a logarithm is off by less than a hundredth, whatever was added."""
 _GROUPS = 8
@@ -117,6 +119,8 @@ def logarithm_error(scan: Scan) -> tuple[Tensor, bool] | None:
     weight = np.exp(-z * z / 2.0) / np.exp(-z * z / 2.0).sum()
     estimate = known[:, None] + np.sqrt((known + noise**2) / 10.0)[:, None] * z
     taken_off = log_bias(torch.from_numpy(estimate).clamp(min=0.0), noise).numpy() @ weight
+    # Above, the bias is taken off well.
+    taken_off = np.where(known < _UNKNOWN * fewest(noise), taken_off, bias)
     found = np.interp(np.log(np.maximum(mean, least)), np.log(known), taken_off - bias)
     return torch.from_numpy(found), True
 

@@ -92,7 +92,8 @@ def orbit_plane(lines: Tensor, geometry: ConeBeam) -> OrbitPlane | None:
     counts = np.where(heights > 0, 2, 1)
     off_axis = geometry.sod * torch.from_numpy(np.sin(geometry.fan_angles)).to(lines)
     reach = float(off_axis.abs().max())
-    flat = max(0.5, _FLAT_CELLS * geometry.sod / reach) * row * (1 + 1e-9)
+    flat = max(0.5, _FLAT_CELLS * geometry.sod / reach) if reach else math.inf
+    flat *= row * (1 + 1e-9)
     noise: float | None = None
     best: tuple[float, OrbitPlane] | None = None
     total, lacking, rows = torch.zeros_like(even[0]), torch.zeros_like(even[0]), 0

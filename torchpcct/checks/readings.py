@@ -62,6 +62,8 @@ _DARK = 0.2
 """Part of the brightest mean below which readings are dark."""
 _TOGETHER = (16, 4)
 """Views and columns whose mean tells whether readings are brighter than air."""
+_REPEATED = 0.9
+"""Share of equal readings from which a view is the one before."""
 _LEAST_COLUMNS = 24
 """Columns of a detector that is tested."""
 _LEAST_VIEWS = 16
@@ -112,6 +114,9 @@ def reading_warnings(scan: Scan) -> list[str]:
         return inverted + floor
     if scan.logged:
         return floor + _other_base(lines) + _brighter_than_air(-lines, logarithms=True)
+    # Views that were stored twice have no noise between them; they are named elsewhere.
+    repeated = (counts[1:] == counts[:-1]).mean((1, 2)) > _REPEATED
+    counts = counts[np.r_[True, ~repeated]]
     # Of transmissions the noise says nothing of the photons in each cell.
     unknown = str(scan.info.get("signal_of_one_photon_from")).startswith("noise")
     transfer = [] if unknown else _transfer_texts(counts, quantum)

@@ -125,3 +125,11 @@ def test_thin_bodies_within_the_rows_are_told_nothing(body, rows):
     lines = torch.from_numpy(np.log(1e5 / (n + 0.5)).astype(np.float32))
     assert geometry_test(lines, g).findings == ()
     assert moment_test(lines, g).findings == ()
+
+
+@pytest.mark.parametrize("columns", [1, 2])
+def test_a_detector_of_one_or_two_columns_has_a_plane(columns):
+    """Rays through the axis part nowhere: the way that they part over was divided by."""
+    g = ConeBeam(full_turn(60), SOD, 700.0, columns, 3, (3.0, 3.0))
+    assert orbit_plane(torch.ones(g.shape), g) is not None
+    assert geometry_test(torch.ones(g.shape), g).findings == ()
