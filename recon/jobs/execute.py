@@ -69,9 +69,12 @@ DEATHS = 3
 _ANSWER_S = 8.0
 """That a scheduler may take."""
 _AGAIN_S = 0.5
-"""Until a scheduler is asked a second time for a job that it does not know."""
+"""Until a scheduler is asked a second time for a job that it does not know, or for a worker."""
 _NO_WORKER_S = 30.0
 """Until a cluster without workers is reported."""
+_BACK_S = 300.0
+"""For which a machine that is gone is waited for where all others are left aside: a worker that
+died is started again, which takes long on a busy machine."""
 _LAST_S = 5.0
 """Between asking processes to end and ending them."""
 _SAFE_PATH = "PYTHONSAFEPATH"
@@ -374,6 +377,7 @@ class Cluster(Executor):
         self._given = dict[str, Future[Any]]()
         self._doubted: tuple[float, set[str]] = -9.0, set()
         self._without: tuple[float | None, float] = None, _NO_WORKER_S
+        self._seen = set[str]()  # machines that have had a worker
         from cloudpickle import dumps
 
         self.dumps = dumps
@@ -394,7 +398,19 @@ class Cluster(Executor):
         now = time.monotonic()
         if now - self._asked[0] > 1.0:  # a way to the scheduler and back
             self._asked = now, list(self.client.scheduler_info(-1)["workers"])
+            self._seen.update(map(_machine, self._asked[1]))
         return [a for a in self._asked[1] if _machine(a) not in self.avoid]
+
+    @property
+    def hopeless(self) -> bool:
+        """Whether no worker is left that could take a job: every machine that has had one is left
+        aside, or those that are not have been gone for minutes."""
+        if self.workers or not self.avoid:
+            return False
+        since = self._without[0]
+        return self._seen <= set(self.avoid) or (
+            since is not None and time.monotonic() - since >= _BACK_S
+        )
 
     @property
     def dashboard(self) -> str:
@@ -719,10 +735,12 @@ def _run(
             # No more than there are workers: what waits on one that dies would count as having
             # killed it.
             while ready and len(running) < max(1, workers):
-                job = ready.popleft()
-                if not workers and avoid:
-                    leave_out(job, f"no worker is left: {'; '.join(avoid.values())}")
+                if isinstance(executor, Cluster) and avoid and not workers:
+                    if not executor.hopeless:
+                        break
+                    leave_out(ready.popleft(), f"no worker is left: {'; '.join(avoid.values())}")
                     continue
+                job = ready.popleft()
                 module = job.module or job.function.__module__
                 call = packed_call(executor, (job.function, job.args))
                 running[
@@ -763,6 +781,8 @@ def _run(
                     needs[other.name].discard(job.name)
                     if not needs[other.name] and other.name not in lost:
                         ready.append(other)
+            if ready and not running:
+                time.sleep(_AGAIN_S)
             if isinstance(executor, Cluster):
                 executor.check()
             if progress is not None:

@@ -119,6 +119,7 @@ def unconnected():
     executor.address, executor.avoid, executor._given = "tcp://127.0.0.1:1", {}, {}
     executor._asked, executor._doubted = (-9.0, []), (-9.0, set())
     executor._without = (None, execute._NO_WORKER_S)
+    executor._seen = set()
     executor.client = SimpleNamespace(
         status="running", futures={}, scheduler_info=lambda n: {"workers": ["tcp://127.0.0.1:2"]}
     )
@@ -581,6 +582,44 @@ def test_a_cluster_without_workers_says_so(unconnected, monkeypatch, caplog):
     monkeypatch.setattr(execute, "time", SimpleNamespace(monotonic=lambda: 402.5))
     unconnected.check()
     assert unconnected._without == (None, execute._NO_WORKER_S)
+
+
+@pytest.mark.cluster
+@pytest.mark.parametrize("away_s", [2.0, 299.0, 310.0])
+def test_a_machine_that_comes_back_is_waited_for_where_another_is_left_aside(
+    unconnected, monkeypatch, tmp_path, away_s
+):
+    """While it was started again, all jobs were left out; after minutes they are."""
+    pytest.importorskip("distributed")
+    one, other, now = "tcp://127.0.0.1:1", "tcp://127.0.0.2:2", [0.0]
+    unconnected.client.scheduler_info = lambda n: {
+        "workers": [other] if 0.0 < now[0] <= away_s else [one, other]
+    }
+    unconnected.submit = lambda function, *given: _done(function(*given))
+    clock = SimpleNamespace(
+        monotonic=lambda: now[0],
+        sleep=lambda seconds: now.__setitem__(0, now[0] + seconds),
+        perf_counter=time.perf_counter,
+    )
+    monkeypatch.setattr(execute, "time", clock)
+    assert unconnected.workers == 2
+    unconnected.avoid["127.0.0.2"] = "its disk is full"
+    assert unconnected.workers == 1
+    now[0] = 1.5
+    if away_s < execute._BACK_S:
+        assert run([Job("x", noted, ("x", 1))], tmp_path, unconnected)["x"][0] == 1
+        assert now[0] > away_s
+    else:
+        with pytest.raises(LeftOut, match="no worker is left: its disk is full"):
+            run([Job("x", noted, ("x", 1))], tmp_path, unconnected)
+    unconnected.avoid["127.0.0.1"] = "its disk is full, too"
+    assert unconnected.hopeless
+
+
+def _done(value):
+    future = Future()
+    future.set_result(value)
+    return future
 
 
 @pytest.mark.extended
