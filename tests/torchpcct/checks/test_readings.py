@@ -333,7 +333,5 @@ def test_views_that_were_stored_twice_are_no_dead_time(first, copies):
 
 
 def test_a_mask_is_no_readings():
-    with pytest.raises(
-        TypeError, match="readings must be an array of real numbers, got .* of bool"
-    ):
+    with pytest.raises(TypeError, match="array of real numbers"):
         Scan.from_counts(counted() > 100.0, FAN, air=AIR)
