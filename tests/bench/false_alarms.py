@@ -50,7 +50,11 @@ def alarms(drawn: Drawn, method: str | None = None) -> list[str]:
     scan = drawn.scan()
     if method is None:
         repaired, texts = repair_defects(scan)
-        texts = [*texts, *reading_warnings(repaired), *consistency_warnings(repaired, drawn.grid)]
+        try:
+            found = consistency_warnings(repaired, drawn.grid)
+        except ValueError as error:  # a refusal is an alarm, too
+            found = [str(error)]
+        texts = [*texts, *reading_warnings(repaired), *found]
     else:
         grid = drawn.grid if method == "fbp" else as_fine_as_cells(drawn)
         try:
@@ -120,7 +124,8 @@ def dimmed(drawn: Drawn, photons: tuple[float, float]) -> Drawn:
     rightly = [*drawn.rightly, "photons a reading: how dark"]
     shone = transmissions(dim.geometry, dim.solids, **dim.options)
     if float((dim.photons * dim.profile * shone).min()) < 2.0 * fewest(dim.electronic_noise):
-        rightly.append("that their number is not known")
+        # Cells that read nothing in any view are dead.
+        rightly += ["that their number is not known", "% can be interpolated"]
     return replace(dim, rightly=tuple(rightly))
 
 
