@@ -27,6 +27,7 @@ from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
+from torchpcct.scan_memory import once
 from torchpcct.switches import undisturbed
 
 __all__ = ["InsetProblem"]
@@ -225,6 +226,17 @@ class InsetProblem:
         found = self.term_of(self.projector.T(weighted)[None], exposure)
         return replace(found, energy=energy[None], readings=self.readings)
 
+    @undisturbed
+    def given(self, scan: Scan) -> tuple[Tensor, Quadratic]:
+        """:meth:`data` and :meth:`term` of a scan, kept with it: a second method on the same
+        problem needs the same. Neither may be changed."""
+
+        def compute() -> tuple[Tensor, Quadratic]:
+            data = self.data(scan)
+            return data, self.term(scan, data)
+
+        return once(scan, "term", compute, self)
+
     def term_of(self, b: Tensor, exposure_s: float) -> Quadratic:
         """The data term of b = AᵀW y ``(batch, z, y, x)`` that is known already, W that of the
         exposure."""
@@ -308,10 +320,10 @@ class InsetProblem:
         advance: Callable[[float], None],
     ) -> Iterator[Result]:
         """PWLS of all scans together; ``advance`` gets the finished share of them."""
-        data = [self.data(s) for s in scans]
-        terms = [self.term(s, y) for s, y in zip(scans, data, strict=True)]
-        found, report = self.solve(Quadratic.joined(terms), prior, **options)
-        for scan, lines, values in zip(scans, data, found.to(torch.float32), strict=True):
+        given = [self.given(s) for s in scans]
+        term = Quadratic.joined([term for _, term in given])
+        found, report = self.solve(term, prior, **options)
+        for scan, (lines, _), values in zip(scans, given, found.to(torch.float32), strict=True):
             warnings: list[str] = []
             tests = (
                 []

@@ -63,14 +63,14 @@ class Inset:
     def solve(self, scans: Sequence[Scan]) -> list[Result]:
         """Volumes in HU on the grid that was asked for."""
         network, problem = self.network, self.problem
-        data = [problem.data(s) for s in scans]
-        terms = [problem.term(s, y) for s, y in zip(scans, data, strict=True)]
-        term = replace(Quadratic.joined(terms), operator=problem.gram)
+        given = [problem.given(s) for s in scans]
+        joined = Quadratic.joined([term for _, term in given])
+        term = replace(joined, operator=problem.gram)
         with torch.no_grad():
             solved = network.solve(term)
         found = []
-        for k, (scan, y, (volume, report, before, _)) in enumerate(
-            zip(scans, data, solved, strict=True)
+        for k, (scan, (y, _), (volume, report, before, _)) in enumerate(
+            zip(scans, given, solved, strict=True)
         ):
             report["voxel_mm"] = self._work.spacing[-1]
             peak = float(volume.max())

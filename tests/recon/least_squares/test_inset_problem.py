@@ -1,8 +1,11 @@
 """Model-based reconstruction of an inset from a scan: units, convergence, batches, refusals."""
 
+import gc
+import weakref
 from dataclasses import replace
 
 import pytest
+import torch
 from refusals import refused
 from small_scan import GRID
 
@@ -39,6 +42,30 @@ def test_batch_equals_single(clean, problem):
     for scan, volume in zip(scans, together, strict=True):
         alone = reconstruct(scan, GRID, "pwls", **options)
         assert float((alone.data - volume.data).square().mean().sqrt()) < 0.1
+
+
+def test_readings_of_a_problem_are_prepared_once_and_released_with_their_scan(
+    clean, problem, monkeypatch
+):
+    looked_at, data = [], InsetProblem.data
+    monkeypatch.setattr(
+        InsetProblem, "data", lambda self, scan: looked_at.append(id(scan)) or data(self, scan)
+    )
+    scan = clean.with_noise(2.0, 11)
+    options = {"problem": problem, "tolerance": 5.0}
+    first, second = (reconstruct(scan, GRID, "pwls", **options).data for _ in range(2))
+    assert looked_at == [id(scan)]
+    assert torch.equal(first, second)
+    moved = problem.with_motion(torch.full((scan.geometry.views, 3), 0.1).numpy())
+    moved.given(scan)  # of another problem: other readings
+    assert len(looked_at) == 2
+    scan.counts.mul_(1.001)
+    assert not torch.equal(reconstruct(scan, GRID, "pwls", **options).data, first)
+    assert len(looked_at) == 3
+    alive = weakref.ref(problem.given(scan)[0])
+    del scan
+    gc.collect()
+    assert alive() is None
 
 
 def test_prior_lowers_the_noise(clean, problem):
