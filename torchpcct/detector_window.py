@@ -116,7 +116,8 @@ class DetectorWindow:
                 ``values``.
             out: where the result is written, ``values`` itself for instance; None: a new tensor.
         """
-        if values.device.type != "cpu" or values.ndim != cells.ndim + 1:
+        tracked = torch.is_grad_enabled() and (values.requires_grad or cells.requires_grad)
+        if tracked or values.device.type != "cpu" or values.ndim != cells.ndim + 1:
             return torch.sub(values, self.take(cells), out=out)
         if out is None:
             out = torch.empty_like(values, dtype=torch.result_type(values, cells))

@@ -48,6 +48,9 @@ def test_what_is_taken_off_every_view_is_that_of_its_cells(bins):
     assert torch.equal(window.less(both, cells)[1], 2 * values - window.take(cells))
     own = left.clone()
     assert window.less(own, cells, out=own) is own
+    tracked = values.clone().requires_grad_(True)
+    window.less(tracked, cells).sum().backward()
+    assert torch.equal(tracked.grad, torch.ones_like(values))
     assert torch.equal(own, left - window.take(cells))
 
 
