@@ -217,6 +217,12 @@ class Pieces:
         self._asked.add(self._prefix + name)
         if self._store is None:
             return compute()
+        planning = isinstance(execute.current(), execute.Planner)
+        if planning and not self._store.has(self._prefix + name, self._key):
+            raise execute.Planned(
+                f"nothing was run: the study computes {self._prefix + name!r} in one process "
+                "first, and lists jobs, if it has any, once that is kept"
+            )
         found: T = self._store.piece(self._prefix + name, self._key, compute)
         return found
 

@@ -200,12 +200,11 @@ def measure(
     s, seen = settings, Seen()
     pieces = Pieces(folder, replace(s, kinds=tuple(KINDS), vessels=1))
     rows: list[JsonObject] = []
+    vessels = range(s.first, s.first + s.vessels)
+    pieces.ahead(_path, *((kind, vessel) for kind in s.kinds for vessel in vessels))
     for kind in s.kinds:
-        within = pieces.within(kind.replace(" ", "_"))
-        for done, vessel in enumerate(range(s.first, s.first + s.vessels)):
-            truth, motions, found, seconds = within(
-                f"{vessel}", partial(_estimated, s, kind, vessel)
-            )
+        for done, vessel in enumerate(vessels):
+            truth, motions, found, seconds = _path(s, pieces, kind, vessel)
             jump = next((m for m in motions if isinstance(m, Jump)), None)
             for exposure, one, cpu in zip(s.exposures_s, found, seconds, strict=True):
                 row = {"kind": kind, "vessel": vessel, "exposure_s": exposure, "cpu_seconds": cpu}
@@ -220,6 +219,13 @@ def measure(
         for exposure in s.exposures_s
     ]
     return Measured(s, {"paths": rows, "kinds": summary, "mbir_seconds": mbir}, seen)
+
+
+def _path(
+    s: PathsSettings, pieces: Pieces, kind: str, vessel: int
+) -> tuple[Floats, Motions, list[InsetMotion], list[float]]:
+    """The piece of one vessel."""
+    return pieces.within(kind.replace(" ", "_"))(f"{vessel}", partial(_estimated, s, kind, vessel))
 
 
 def _estimated(

@@ -807,6 +807,13 @@ def test_a_dry_run_lists_the_jobs(here, cli):
     assert not list((here / "x").rglob("*.npz"))
 
 
+@pytest.mark.parametrize("name", ["noise", "paths"])
+def test_a_dry_run_of_a_study_computes_nothing(here, cli, name):
+    text = cli(f"study {name} --dry-run --out x")
+    assert "50 jobs" in text if name == "paths" else "nothing was run" in text
+    assert not list(here.rglob("*.npz"))
+
+
 CALLED = """
 import pickle, sys
 from pathlib import Path
