@@ -574,7 +574,6 @@ _SIZED = (
 """Why no test can see it: another size."""
 _FAINT = "neighbouring views differ by less than their noise"
 """Why no test can see it: noise."""
-"""Why no test can see it: edges."""
 _PLANE = "only the plane of the source has conjugate rays, and rows beside it are averaged"
 """Why no test can see it: a cone beam's rows."""
 _SCALED = "line integrals tell attenuation, not what of it is water's"
