@@ -29,9 +29,7 @@ sphere = Body(
     "sphere", Ellipsoid((1.5, 1.5, 1.5), position=(30.0, 0.0, 0.0)), "necrotic_core", "patient"
 )
 inset = VolumeGrid((41, 45, 45), 0.2, (0.0, 0.0, 30.0))
-task = Task(
-    "a sphere of 3 mm in water", Scene([patient, sphere]), "sphere", presets.pcct(views=123), inset
-)
+task = Task("sphere_in_water", Scene([patient, sphere]), "sphere", presets.pcct(views=123), inset)
 found = evaluate(task, [denoiser(mine, "fbp:standard", "mine")], exposures_s=[1.0], n=8)
 rows = [r for r in found.records if r["method"] == "mine" and r["figure"].startswith("dose factor")]
 rows = [r for r in rows if r["where"] in ("patient", "lesion")]
