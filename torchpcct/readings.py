@@ -91,6 +91,8 @@ _TRANSFER_SIGMAS = 3.0
 """Standard errors by which a photon transfer must differ from 1: less, and readings are counts."""
 MEDIAN_TO_SD = 1.4826
 """Standard deviation over median absolute deviation, of normal values."""
+QUARTILES_TO_SD = 1.0 / 1.349
+"""Standard deviation over the distance of the quartiles, of normal values."""
 _BLOCK = 2**20
 """Readings that are interpolated at a time, about."""
 MOST_DEAD = 0.25
@@ -408,6 +410,20 @@ def _photons(p: Tensor, mask: Tensor, geometry: Geometry) -> float:
     return float(min(max(1.0 / max(sd, 1e-4) ** 2, 1.0), 1e8))
 
 
+def second_differences(
+    values: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Second differences along the last axis, and the means of their three values: white noise has
+    six times its variance in the former."""
+    before, here, after = values[..., :-2], values[..., 1:-1], values[..., 2:]
+    return after - 2.0 * here + before, (after + here + before) / 3.0
+
+
+def quartile_sd(values: NDArray[np.float64]) -> float:
+    """Standard deviation of normal values, from their quartiles: edges among them count little."""
+    return float(np.subtract(*np.quantile(values, (0.75, 0.25)))) * QUARTILES_TO_SD
+
+
 def dispersion(readings: Tensor, rows: bool) -> float:
     """Variance over mean of the noise between neighbours: the reading of one photon; 1 of Poisson
     counts.
@@ -477,8 +493,7 @@ def expected(
         noise: standard deviation of the electronics, in counts.
         function: of an array of counts, elementwise.
     """
-    z = np.linspace(-6.0, 6.0, 121) if noise else np.zeros(1)
-    weight = np.exp(-z * z / 2.0) / np.exp(-z * z / 2.0).sum()
+    z, weight = normal_nodes(6.0, 121) if noise else (np.zeros(1), np.ones(1))
     found: NDArray[np.float64]
     if noise > _MUCH_NOISE:
         spread = np.sqrt(mean + noise**2)[:, None]
@@ -490,6 +505,13 @@ def expected(
     probability = np.exp(n * np.log(mean)[:, None] - mean[:, None] - factorial)
     found = probability @ (function(n[:, None] + noise * z) @ weight)
     return found
+
+
+def normal_nodes(reach: float, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Values of a standard normal variable, up to ``reach`` on either side, and their weights."""
+    z = np.linspace(-reach, reach, count)
+    weight = np.exp(-z * z / 2.0)
+    return z, weight / weight.sum()
 
 
 def fewest(noise: float) -> float:

@@ -317,7 +317,7 @@ class Field:
             parts = rest if problem.plane else [rest]
             mu = [x + d for x, d in zip(around, parts, strict=True)]
             volume, report, _, _ = network.results(
-                normal, u, problem.hu(mu)[None], whole=normal.less(-taken)
+                normal, u, problem.hu(mu)[None], normal.left(u), whole=normal.less(-taken)
             )[0]
         seen = scales[gram.determined]
         seen = seen[:: max(1, seen.numel() // 10**6)]

@@ -207,9 +207,11 @@ class Mbir:
         normal = self.normal(term)
         u, notes = self._solved(term, normal)
         with torch.no_grad():
+            left = normal.left(u)
             passed = low_pass(normal, torch.full_like(normal.unit_hu, self.fidelity))
-            missing = missing_body(normal, normal.left(u), 1.0 - passed)
-        found = zip(self.results(normal, u, normal.hu(u)), notes, missing, strict=True)
+            missing = missing_body(normal, left, 1.0 - passed)
+        results = self.results(normal, u, normal.hu(u), left)
+        found = zip(results, notes, missing, strict=True)
         return [
             result._replace(
                 report=result.report
@@ -222,7 +224,12 @@ class Mbir:
 
     @torch.no_grad()
     def results(
-        self, normal: Quadratic, u: Tensor, volumes: Tensor, whole: Quadratic | None = None
+        self,
+        normal: Quadratic,
+        u: Tensor,
+        volumes: Tensor,
+        left: Tensor,
+        whole: Quadratic | None = None,
     ) -> list[Result]:
         """Volumes with their reports: ``method``, ``iterations``, ``fidelity``, ``residual``
         (:func:`recon.mbir.unrolled.low_residual`), ``chi2`` where yᵀW y is known,
@@ -232,10 +239,10 @@ class Mbir:
             normal: the data term in noise units.
             u: the volumes in these units.
             volumes: the same as they are given back.
+            left: what the volumes leave of the data, ``normal.left(u)``.
             whole: the data term before something was taken off that the volumes show; None:
                 ``normal``.
         """
-        left = normal.left(u)
         residual = low_residual(whole or normal, left, self.fidelity).tolist()
         chi2 = [None] * len(u) if normal.energy is None else normal.chi2(u, left).tolist()
         same = {"method": "mbir", "iterations": self.model.steps, "fidelity": self.fidelity}

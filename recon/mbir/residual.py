@@ -38,6 +38,7 @@ from recon.mbir.frequencies import (
     squared_frequencies,
     to_frequencies,
 )
+from torchpcct.readings import MEDIAN_TO_SD
 
 _BLOCK = 16
 """Edge of a block in voxels: at 0.2 mm 3.2 mm, some periods of the finest lines."""
@@ -67,8 +68,6 @@ edges leave in the data of voxels, up to 200 HU at the end of a lumen, stands ou
 _MOST_NOISE = 1.5
 """What is left of the data in most places is taken for noise up to so many times their noise:
 sound vessels have 1.34 at most. Beyond, it is what is missing."""
-_MEDIAN = 0.6745
-"""Median of the size of a normal variable, in standard deviations."""
 
 
 class MissingBody(NamedTuple):
@@ -139,12 +138,13 @@ def missing_body(problem: Quadratic, left: Tensor, kept: Tensor) -> list[Missing
         template = from_frequencies(at_middle * ball, shape)
         seen = from_frequencies(at_middle * ball * kept, shape)
         # In the middle of the volume, with H itself; towards the rim both are smaller.
-        deviation = (seen * problem.apply(seen)).sum(_AXES).sqrt()
-        signal = (template * problem.apply(seen)).sum(_AXES)
+        response = problem.apply(seen)
+        deviation = (seen * response).sum(_AXES).sqrt()
+        signal = (template * response).sum(_AXES)
         inside = (slice(None), *(slice(rim, n - rim) for n in shape))
         score = from_frequencies(spectrum * ball, shape)[inside]
         # A prior that sharpens leaves more in the data than their noise.
-        typical = score.abs().flatten(1).median(1).values / _MEDIAN
+        typical = MEDIAN_TO_SD * score.abs().flatten(1).median(1).values
         unit = typical.clamp(deviation, _MOST_NOISE * deviation).clamp_min(
             torch.finfo(typical.dtype).tiny
         )

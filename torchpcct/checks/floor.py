@@ -33,6 +33,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchpcct.readings import quartile_sd, second_differences
+
 __all__ = ["Floor", "clipped_floor", "folded_share"]
 
 Floats = NDArray[np.float64]
@@ -151,8 +153,7 @@ def folded_share(counts: Floats) -> float:
 def _noise_of_the_darkest(counts: Floats) -> float:
     """Standard deviation of the darkest readings about their neighbours in the row; 0 where what
     changes between them is no noise."""
-    second = counts[..., 2:] - 2.0 * counts[..., 1:-1] + counts[..., :-2]
-    mean = (counts[..., 2:] + counts[..., 1:-1] + counts[..., :-2]) / 3.0
+    second, mean = second_differences(counts)
     known = np.isfinite(second)
     if not known.any():
         return 0.0
@@ -164,8 +165,7 @@ def _noise_of_the_darkest(counts: Floats) -> float:
     a, b = second[..., 1:][both], second[..., :-1][both]
     if (a * b).sum() > _WHITE * math.sqrt(float((a * a).sum() * (b * b).sum())):
         return 0.0
-    quartiles = float(np.subtract(*np.quantile(second[dark], (0.75, 0.25))))
-    return quartiles / 1.349 / math.sqrt(6.0)
+    return quartile_sd(second[dark]) / math.sqrt(6.0)
 
 
 def _repeated(counts: Floats, lowest: float) -> float:
@@ -237,8 +237,7 @@ def _photon(x: Floats) -> float:
 
     Infinite where that cannot be told.
     """
-    a, b, c = x[..., :-2], x[..., 1:-1], x[..., 2:]
-    second, mean = a - 2.0 * b + c, (a + b + c) / 3.0
+    second, mean = second_differences(x)
     known = np.isfinite(second)
     second, mean = second[known], mean[known]
     if second.size < _LEAST:
@@ -251,8 +250,7 @@ def _photon(x: Floats) -> float:
         number = int(chosen.sum())
         if number < _LEAST:
             continue
-        quartiles = float(np.subtract(*np.quantile(second[chosen], (0.75, 0.25))))
-        m, v = float(mean[chosen].mean()), (quartiles / 1.349) ** 2 / 6.0
+        m, v = float(mean[chosen].mean()), quartile_sd(second[chosen]) ** 2 / 6.0
         if v > 0.0 and m > _CLEAR * math.sqrt(v):
             found.append((m, v, number / v**2))
     if not found:

@@ -27,6 +27,8 @@ from torchpcct.readings import (
     fewest,
     log_bias,
     many,
+    normal_nodes,
+    second_differences,
     shifted,
     smoothed,
 )
@@ -115,8 +117,7 @@ def logarithm_error(scan: Scan) -> tuple[Tensor, bool] | None:
     least = max(_LEAST_MEAN, noise / _AROUND)
     known = np.geomspace(least, many(noise), 80)
     bias = expected(known, noise, lambda n: np.log(shifted(n, noise))) - np.log(known)
-    z = np.linspace(-3.0, 3.0, 31)
-    weight = np.exp(-z * z / 2.0) / np.exp(-z * z / 2.0).sum()
+    z, weight = normal_nodes(3.0, 31)
     estimate = known[:, None] + np.sqrt((known + noise**2) / 10.0)[:, None] * z
     taken_off = log_bias(torch.from_numpy(estimate).clamp(min=0.0), noise).numpy() @ weight
     # Above, the bias is taken off well.
@@ -258,8 +259,7 @@ def _transfer(y: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def _along(y: Floats) -> tuple[Floats, Floats, Floats]:
-    second = y[..., 2:] - 2.0 * y[..., 1:-1] + y[..., :-2]
-    mean = (y[..., 2:] + y[..., 1:-1] + y[..., :-2]) / 3.0
+    second, mean = second_differences(y)
     known = np.isfinite(second) & (mean > 0.0)
     second, mean = second[known], mean[known]
     if second.size < _FEWEST:

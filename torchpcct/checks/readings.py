@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.checks.floor import clipped_floor, folded_share
-from torchpcct.readings import DIM, FEWEST, MEDIAN_TO_SD, smoothed
+from torchpcct.readings import (
+    DIM,
+    FEWEST,
+    MEDIAN_TO_SD,
+    quartile_sd,
+    second_differences,
+    smoothed,
+)
 from torchpcct.scan import Scan
 
 __all__ = ["reading_warnings"]
@@ -217,7 +224,7 @@ def _other_base(lines: NDArray[np.float64]) -> list[str]:
             number = int(chosen.sum())
             if number < 60 or both.sum() < 40:
                 continue
-            sd = float(np.subtract(*np.quantile(second[chosen], (0.75, 0.25)))) / 1.349
+            sd = quartile_sd(second[chosen])
             a, b = second[1:][both], second[:-1][both]
             small = (np.abs(a) < 4.0 * sd) & (np.abs(b) < 4.0 * sd)
             a, b = a[small], b[small]
@@ -454,8 +461,7 @@ def _transfer(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Mean, variance (between neighbours on the last axis) and number of the readings between
     ``edges``."""
-    second = n[..., 2:] - 2.0 * n[..., 1:-1] + n[..., :-2]
-    mean = (n[..., 2:] + n[..., 1:-1] + n[..., :-2]) / 3.0
+    second, mean = second_differences(n)
     known = np.isfinite(second)
     second, mean = second[known], mean[known]
     at = np.clip(np.searchsorted(edges, mean, side="right") - 1, 0, len(edges) - 2)
@@ -467,7 +473,7 @@ def _transfer(
     found = [
         (
             mean[p].mean(),
-            (np.subtract(*np.quantile(second[p], (0.75, 0.25))) / 1.349) ** 2 * mean[p].mean(),
+            quartile_sd(second[p]) ** 2 * mean[p].mean(),
         )
         if p.size
         else (0.0, 0.0)
