@@ -150,7 +150,7 @@ def reconstruct(
             CPU all the same: tests and repair of the readings, tests of what a volume leaves of
             them, the fit of an inset's FFT model, and what is drawn of a vessel. All else runs on
             the device, with Triton's kernels.
-        motion: of an inset whose surround is known (``acquire(…, region=)``), which stands still:
+        motion: of an inset whose exterior is known (``acquire(…, region=)``), which stands still:
             its displacement in every view, ``(views, 3)`` z, y, x mm; ``"estimate"``: from the
             readings themselves (:func:`recon.motion.estimate_motion`), with the path, its errors
             and whether the readings hold it under ``motion`` in the report, scan by scan; or what
@@ -275,7 +275,7 @@ def _moving(
         )
     if scan.window is None:
         raise ValueError(
-            "motion needs the surround of the inset, which stands still: acquire the scan with "
+            "motion needs the exterior of the inset, which stands still: acquire the scan with "
             "region="
         )
     path, found = path_of(motion, _here(scan), grid)

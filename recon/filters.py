@@ -173,8 +173,8 @@ def nlm(
     search: int = 4,
     told: float = 1.0,
 ) -> Image:
-    """Non-local means in 3-D: a mean over voxels whose surrounds are alike (Buades, Coll, Morel
-    2005, CVPR).
+    """Non-local means in 3-D: a mean over voxels whose neighbourhoods are alike (Buades, Coll,
+    Morel 2005, CVPR).
 
     Weights are exp(−max(D² − 2 told² noise², 0) / (strength · noise)²), D² the mean squared
     difference of two cubes. (scikit-image's fast mode compares cubes that are not centred: there a

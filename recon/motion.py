@@ -1,12 +1,12 @@
 """Motion of an inset, estimated from its own scan, with an interval and a test.
 
-What lies in the inset moves rigidly along a smooth path; its surround is known and stands still.
+What lies in the inset moves rigidly along a smooth path; its exterior is known and stands still.
 The path is found together with the volume by variable projection
 (:mod:`recon.variable_projection`): FBP along the present path gives the volume, the derivatives of
 its projections by the displacement in every view are what the path does to the readings, and what
 another volume would explain of them is taken off.
 
-**Start.** The centre of mass of what is left when the surround is taken off moves on the detector
+**Start.** The centre of mass of what is left when the exterior is taken off moves on the detector
 as the inset does, whatever the inset looks like (the first of the consistency conditions of
 Helgason and Ludwig). A path fitted to it does not sit in the local minimum of no motion.
 
@@ -255,7 +255,7 @@ class _Problem:
         self.window = self._window()
         window = scan.window
         assert window is not None
-        around = window.take(scan.surround_line_integrals())
+        around = window.take(scan.exterior_line_integrals())
         place, here = (_centre_columns(g, self.grid) for g in (geometry, self.geometry))
         shift = place - self._averaging.astype(bool).T @ here
 
@@ -265,7 +265,7 @@ class _Problem:
             return found * counts.view(-1, 1, 1) if total else found
 
         self.lines = averaged(scan.line_integrals().float() - around.float(), 0.0, False)
-        self.weights = averaged(window.take(scan.surround_weights()).float(), None, True)
+        self.weights = averaged(window.take(scan.exterior_weights()).float(), None, True)
 
     def _window(self) -> DetectorWindow:
         """The readings of the working grid wherever it may be."""
@@ -652,7 +652,7 @@ def estimate_motion(
 
     Args:
         scan: counting, one channel, of a cone beam on a circle, acquired with ``region``: the
-            surround is known, all else lies in the region at all times.
+            exterior is known, all else lies in the region at all times.
         grid: ``(z, y, x)`` grid of the inset; the working grid covers the scan's region.
         heart_rate: beats a minute; the path then repeats itself with every beat and does not jump.
             None: any smooth path, a cubic spline, with one jump if the readings hold one.
@@ -665,7 +665,7 @@ def estimate_motion(
         model of voxels and of what no view sees, under the prior.
 
     Raises:
-        ValueError: an unknown surround, energy bins, another geometry, fewer than 48 views, a path
+        ValueError: an unknown exterior, energy bins, another geometry, fewer than 48 views, a path
             longer than 2.5 mm from its mean, a heart's rate without the time of a turn.
         TypeError: no :class:`torchpcct.Scan`.
     """
@@ -850,9 +850,9 @@ def _require_inset(scan: Scan) -> None:
             "motion is estimated of a cone beam on a circle, this scan has a "
             f"{type(scan.geometry).__name__}: give the displacement in every view, motion=path"
         )
-    if scan.window is None or scan.surround is None:
+    if scan.window is None or scan.exterior is None:
         raise ValueError(
-            "the motion of an inset and an unknown surround cannot both be found: acquire the "
+            "the motion of an inset and an unknown exterior cannot both be found: acquire the "
             "scan with region="
         )
     if scan.counts.ndim != 3:

@@ -75,7 +75,7 @@ class ScanFields(TypedDict, total=False):
     exposure_s: float | None
     seed: int | None
     window: DetectorWindow | None
-    surround: Tensor | None
+    exterior: Tensor | None
     counting: bool
     info: dict[str, object]
     quantum: Tensor | None

@@ -30,7 +30,7 @@ from torchpcct.readings import (
 from torchpcct.scan_file import scan_fields, write_scan
 from torchpcct.scan_grid import grid_of
 from torchpcct.scanner.linearisation import WaterLinearisation
-from torchpcct.validate import UNITS, checked, choice, number, whole
+from torchpcct.validate import UNITS, checked, choice, now_called, number, whole
 
 if TYPE_CHECKING:
     from torchpcct.readings import ReadingFields
@@ -41,7 +41,7 @@ __all__ = ["Scan"]
 
 NOISE_FREE_EXPOSURE_S = 1.0
 """The exposure that the expected readings of a noise-free scan stand for."""
-_TENSORS = ("counts", "air", "surround", "quantum", "flux", "dead")
+_TENSORS = ("counts", "air", "exterior", "quantum", "flux", "dead")
 """Members that lie on a device."""
 
 
@@ -62,7 +62,7 @@ class Scan:
         exposure_s: duration of the scan in s; None: noise free.
         seed: seed of the noise; None: noise free.
         window: the part of the detector that was kept; None: all of it.
-        surround: ``air``-shaped expected readings of every cell outside the window, the same in all
+        exterior: ``air``-shaped expected readings of every cell outside the window, the same in all
             views; given if and only if ``window`` is.
         counting: True: readings are photon counts with Poisson noise. False: an energy-integrating
             detector's signal, or energy bins summed with weights (:meth:`weighted`).
@@ -85,7 +85,7 @@ class Scan:
 
     Raises:
         ValueError: NaN, Inf or negative counts, no counts at all, readings in air or of the
-            surround that are NaN, infinite or ≤ 0, an exposure ≤ 0, shapes that do not fit the
+            exterior that are NaN, infinite or ≤ 0, an exposure ≤ 0, shapes that do not fit the
             geometry, a water correction of another detector, a window beyond the detector.
         TypeError: a member of the wrong kind.
     """
@@ -97,7 +97,7 @@ class Scan:
     exposure_s: float | None = None
     seed: int | None = None
     window: DetectorWindow | None = None
-    surround: Tensor | None = None
+    exterior: Tensor | None = None
     counting: bool = True
     info: Mapping[str, Any] = field(default_factory=dict)
     quantum: Tensor | None = None
@@ -107,6 +107,18 @@ class Scan:
     logged: bool = False
     unit: str = "HU"
     region: VolumeGrid | None = None
+
+    if not TYPE_CHECKING:  # to mypy every attribute would exist
+
+        def __new__(cls, *args: object, **kwargs: object) -> Scan:
+            if former := now_called(kwargs):
+                raise TypeError(f"unknown argument of Scan{former}")
+            return super().__new__(cls)
+
+        def __getattr__(self, name: str) -> object:
+            if former := now_called([name]):
+                raise AttributeError(f"Scan has no attribute {name}{former}")
+            return object.__getattribute__(self, name)  # Python's own error
 
     def __post_init__(self) -> None:
         _check(self)
@@ -287,7 +299,7 @@ class Scan:
             self,
             counts=readings,
             air=self.air * scale,
-            surround=None if self.surround is None else self.surround * scale,
+            exterior=None if self.exterior is None else self.exterior * scale,
             exposure_s=float(exposure_s),
             seed=int(seed),
         )
@@ -337,7 +349,7 @@ class Scan:
             self,
             counts=readings,
             air=self.air * fraction,
-            surround=None if self.surround is None else self.surround * fraction,
+            exterior=None if self.exterior is None else self.exterior * fraction,
             exposure_s=float(self.exposure_s or 0.0) * fraction,
             logged=False,
             info={**self.info, "lower_dose": note},
@@ -524,9 +536,9 @@ class Scan:
         return self.electronic_noise / float(self.quantum.median())
 
     def _expected(self, readings: Tensor) -> Tensor:
-        """Expected readings: those of a known surround, or the mean over the neighbours of each."""
-        if self.surround is not None:
-            return self._at_window(self.surround).expand(readings.shape)
+        """Expected readings: those of a known exterior, or the mean over the neighbours of each."""
+        if self.exterior is not None:
+            return self._at_window(self.exterior).expand(readings.shape)
         return smoothed(readings, self.dead, self.geometry.has_rows)
 
     def _logarithm(self) -> Tensor:
@@ -587,18 +599,18 @@ class Scan:
             shifted += (sigma**2 / 2) / self.counts.clamp(min=sigma)
         return torch.maximum(shifted, half)
 
-    def surround_line_integrals(self) -> Tensor:
-        """Water-linearised line integrals of the surround (noise free), ``(..., rows, columns)``.
+    def exterior_line_integrals(self) -> Tensor:
+        """Water-linearised line integrals of the exterior (noise free), ``(..., rows, columns)``.
 
         Raises:
             ValueError: the scan is not windowed.
         """
-        if self.surround is None:
-            raise ValueError("a full scan has no surround: use line_integrals()")
-        return self.linearisation.apply(torch.log(self.air) - torch.log(self.surround))
+        if self.exterior is None:
+            raise ValueError("a full scan has no exterior: use line_integrals()")
+        return self.linearisation.apply(torch.log(self.air) - torch.log(self.exterior))
 
-    def surround_weights(self) -> Tensor:
-        """Statistical weights of :meth:`surround_line_integrals`, as if every cell were read:
+    def exterior_weights(self) -> Tensor:
+        """Statistical weights of :meth:`exterior_line_integrals`, as if every cell were read:
         inverse variances at the exposure of the scan, ``(rows, columns)``.
 
         What a quantum signals is that behind the object, the mean over the views in which the cell
@@ -608,16 +620,16 @@ class Scan:
             ValueError: the scan is not windowed, has several channels, does not hold ``quantum``,
                 or electronic noise, whose share of the variance changes with the exposure.
         """
-        if self.surround is None or self.window is None or self.counts.ndim != 3:
-            raise ValueError("weights of the surround need a windowed scan of one channel")
+        if self.exterior is None or self.window is None or self.counts.ndim != 3:
+            raise ValueError("weights of the exterior need a windowed scan of one channel")
         self._require_noise_model()
         if self.electronic_noise:
             raise ValueError(
                 "the electronic noise of this scan does not scale with the exposure, as the "
                 "weights of an inset do: use fbp"
             )
-        slope = self.linearisation.slope(self.air.log() - self.surround.log())
-        weights = self.surround / slope.square_()
+        slope = self.linearisation.slope(self.air.log() - self.exterior.log())
+        weights = self.exterior / slope.square_()
         return weights if self.quantum is None else weights / self._mean_per_cell(self.quantum)
 
     def _mean_per_cell(self, readings: Tensor) -> Tensor:
@@ -675,8 +687,8 @@ def _check(scan: Scan) -> None:
     expected_air = (*scan.counts.shape[:-axes], *g.shape[1:])
     if tuple(scan.air.shape) != expected_air:
         raise ValueError(f"air has shape {tuple(scan.air.shape)}, expected {expected_air}")
-    if (w is None) != (scan.surround is None):
-        raise ValueError("a windowed scan needs the readings of its surround, a full scan has none")
+    if (w is None) != (scan.exterior is None):
+        raise ValueError("a windowed scan needs the readings of its exterior, a full scan has none")
     if scan.region is not None and (w is None or scan.region.ndim != 3):
         raise ValueError(
             "region must be the (z, y, x) grid that a windowed scan was kept for; a full scan has "
@@ -689,9 +701,9 @@ def _check(scan: Scan) -> None:
             f"the water correction is that of {scan.linearisation.scale.size} columns, the "
             f"detector has {g.columns}"
         )
-    if scan.surround is not None and scan.surround.shape != scan.air.shape:
+    if scan.exterior is not None and scan.exterior.shape != scan.air.shape:
         raise ValueError(
-            f"surround has shape {tuple(scan.surround.shape)}, air {tuple(scan.air.shape)}"
+            f"exterior has shape {tuple(scan.exterior.shape)}, air {tuple(scan.air.shape)}"
         )
     check_exposure(scan.exposure_s)
     low, high = (
@@ -712,7 +724,7 @@ def _check(scan: Scan) -> None:
         raise ValueError(
             "all counts are zero: the scan holds no signal (exposure too low, or beam blocked)"
         )
-    for name, readings in (("air", scan.air), ("surround", scan.surround)):
+    for name, readings in (("air", scan.air), ("exterior", scan.exterior)):
         if readings is not None and not bool(((readings > 0) & torch.isfinite(readings)).all()):
             raise ValueError(
                 f"{name} readings must be finite and greater than 0 in every cell: mask dead "
@@ -741,9 +753,9 @@ def _check_kinds(scan: Scan) -> None:
         )
     if scan.region is not None and not isinstance(scan.region, VolumeGrid):
         raise TypeError(f"region must be a VolumeGrid or None, got {type(scan.region).__name__}")
-    for name in ("counts", "air", "surround", "quantum"):
+    for name in ("counts", "air", "exterior", "quantum"):
         values = getattr(scan, name)
-        if values is None and name in ("surround", "quantum"):
+        if values is None and name in ("exterior", "quantum"):
             continue
         if not isinstance(values, Tensor) or values.dtype not in (torch.float32, torch.float64):
             found = values.dtype if isinstance(values, Tensor) else type(values).__name__

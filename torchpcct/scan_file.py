@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 G = TypeVar("G", bound=Geometry)
 
-_VERSION = 5
+_VERSION = 6
 """2: energy-integrating scans with their noise model. 3: with a checksum
 (:func:`torchpcct.files.write_hdf5`). 4: parallel and fan beams, flux, dead readings, units. 5:
 geometries given view by view; the region of a window, which earlier files lack and earlier readers
-leave aside."""
+leave aside. 6: the readings outside of a window are called exterior, before surround."""
 _CHUNK_ROWS = 64
 """Readings are compressed in blocks of one view and so many rows: fast to write, and a window of
 views, or of rows, can be read without the rest."""
@@ -73,10 +73,10 @@ def write_scan(scan: Any, path: str | os.PathLike[str]) -> None:
             file.create_dataset("dead", data=scan.dead.numpy(), chunks=chunk, **_HDF5_COMPRESSION)
         write_geometry(file.create_group("geometry"), scan.geometry)
         scan.linearisation.save(file.create_group("linearisation"))
-        if scan.window is not None and scan.surround is not None:
+        if scan.window is not None and scan.exterior is not None:
             window = file.create_group("window")
             window["first_column"] = scan.window.first_column
-            window["surround"] = scan.surround.numpy()
+            window["exterior"] = scan.exterior.numpy()
             window.attrs.update(
                 columns=scan.window.columns, first_row=scan.window.first_row, rows=scan.window.rows
             )
@@ -107,7 +107,7 @@ def scan_fields(
         )
     if not file.attrs.get("complete", False):
         raise ValueError(f"{path} was not written to its end: simulate it again")
-    window = surround = region = None
+    window = exterior = region = None
     if "window" in file:
         w = file["window"]
         window = DetectorWindow(
@@ -116,7 +116,7 @@ def scan_fields(
             int(w.attrs["first_row"]),
             int(w.attrs["rows"]),
         )
-        surround = torch.from_numpy(w["surround"][()])
+        exterior = torch.from_numpy(w["exterior" if "exterior" in w else "surround"][()])
         if "region_shape" in w.attrs:
             shape, spacing, center = (
                 w.attrs[f"region_{name}"].tolist() for name in ("shape", "spacing_mm", "center_mm")
@@ -148,7 +148,7 @@ def scan_fields(
         "exposure_s": float(file.attrs["exposure_s"]) if "exposure_s" in file.attrs else None,
         "seed": int(file.attrs["seed"]) if "seed" in file.attrs else None,
         "window": window,
-        "surround": surround,
+        "exterior": exterior,
         "counting": bool(file.attrs["counting"]),
         "info": info,
         "quantum": held("quantum_kev") if "quantum_kev" in file else None,

@@ -23,7 +23,7 @@ MOST = 6
 """Findings kept of a scan; the oldest go first."""
 MOST_SCANS = 4
 """Scans of which anything is kept: the latest."""
-_TENSORS = ("counts", "air", "surround", "quantum", "dead")
+_TENSORS = ("counts", "air", "exterior", "quantum", "dead")
 """Members of a scan whose change forgets what was found out about it."""
 
 _found: OrderedDict[int, tuple[weakref.ref[Scan], Hashable, OrderedDict[Hashable, Any]]]

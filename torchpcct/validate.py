@@ -24,6 +24,21 @@ UNITS = ("HU", "mm^-1", "pixel^-1")
 """Of scans and volumes; of ``pixel^-1`` all lengths are in pixels."""
 
 
+FORMER_NAMES = {
+    "decompose_surround": "decompose_exterior",
+    "surround": "exterior",
+    "surround_line_integrals": "exterior_line_integrals",
+    "surround_weights": "exterior_weights",
+}
+"""Public names that have changed → what they are called now."""
+
+
+def now_called(names: Iterable[str]) -> str:
+    """``: surround is now called exterior`` for the first of the names that has changed
+    (:data:`FORMER_NAMES`), to be put behind an error; nothing if none has."""
+    return next((f": {n} is now called {FORMER_NAMES[n]}" for n in names if n in FORMER_NAMES), "")
+
+
 class Limits(TypedDict, total=False):
     """What :func:`number` holds a value to."""
 
@@ -306,7 +321,9 @@ def checked(function: F) -> F:
     def call(*args: object, **kwargs: object) -> object:
         try:
             given = signature.bind(*args, **kwargs).arguments
-        except TypeError:
+        except TypeError as error:
+            if former := now_called(kwargs):
+                raise TypeError(f"{function.__qualname__}(): {error}{former}") from None
             return function(*args, **kwargs)  # Python's own words name the function, too
         for name, value in given.items():
             if name not in annotations or value is signature.parameters[name].default:

@@ -46,7 +46,7 @@ _CENTRE_MARGIN = 8
 
 
 _FEWEST_VIEWS = 24
-"""Views of a windowed scan whose borders are compared with the surround."""
+"""Views of a windowed scan whose borders are compared with the exterior."""
 _FEWEST_CELLS = 500
 """Cells, each seen in both halves of the views, that the spread of gains is found from."""
 _BLOCKS = 12
@@ -58,12 +58,12 @@ _MOST_READINGS = 3_000_000
 _EVEN = 0.1
 """Relative change over the views of what a row ends at, from which it is no air that is
 described too bright."""
-_SURROUND_TOLERANCE = 0.01
-"""Relative deviation of the readings at a window's borders from its surround that is no finding."""
+_EXTERIOR_TOLERANCE = 0.01
+"""Relative deviation of the readings at a window's borders from its exterior that is no finding."""
 _GAIN_TOLERANCE = 0.004
 """Standard deviation of the gains of single cells that is no finding."""
 _BORDER = 2
-"""Columns at either border of a window that are compared with the surround."""
+"""Columns at either border of a window that are compared with the exterior."""
 _RIM = 0.05
 """Share of the mean line integral of the densest column from which a column passes through the
 object."""
@@ -217,14 +217,14 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid, motion: Floats | None = N
     detector); where they agree, the moments of the views
     (:mod:`torchpcct.checks.moments`: no line integrals, motion) of a whole field; lines through the
     object that no view measured; rows that end inside the object; and of a window whether its
-    borders see the surround, and its cells have one
+    borders see the exterior, and its cells have one
     gain.
 
     Args:
         scan: counting or energy integrating, without energy bins; of several slices the middle one
             is looked at.
         grid: what is reconstructed.
-        motion: of an inset in a known surround, which stands still: its displacement in every view,
+        motion: of an inset in a known exterior, which stands still: its displacement in every view,
             ``(views, 3)`` z, y, x mm. Its readings are compared as they would be at rest.
 
     Returns:
@@ -260,7 +260,7 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid, motion: Floats | None = N
     if lines.ndim > len(geometry.shape):
         lines = lines[lines.shape[0] // 2]
     if window is not None:
-        lines = window.less(lines, scan.surround_line_integrals())
+        lines = window.less(lines, scan.exterior_line_integrals())
         if motion is not None:
             lines = _at_rest(lines, geometry, about, check_motion(motion, geometry.views, 3))
         found = list(geometry_test(lines, geometry, window, about).findings)
@@ -270,7 +270,7 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid, motion: Floats | None = N
                 "theirs: its sign, the order z, y, x, the order of its views?)"
                 for text in found
             ]
-        return [*_surround_texts(_thinned_out(whole)), *found]
+        return [*_exterior_texts(_thinned_out(whole)), *found]
     order = neighbour_test(lines, geometry)
     columns = list(column_test(lines, geometry).findings)
     # in no order at all: conjugate rays and moments are, too
@@ -302,7 +302,7 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid, motion: Floats | None = N
 
 
 def _at_rest(lines: Tensor, geometry: Any, about: tuple[float, float], motion: Floats) -> Tensor:
-    """Readings ``(views, [rows,] columns)`` of what moves, its surround taken off, moved to where
+    """Readings ``(views, [rows,] columns)`` of what moves, its exterior taken off, moved to where
     they would be at rest, between columns and rows; beyond the window stands its border's value.
 
     Exact of parallel rays. Of others what lies off ``about`` is displaced by up to its distance
@@ -402,13 +402,13 @@ def _thinned_out(scan: Scan) -> Scan:
     return scan if stride == 1 or scan.counts.ndim != 3 else scan.select(slice(None, None, stride))
 
 
-def _surround_texts(scan: Scan) -> list[str]:
+def _exterior_texts(scan: Scan) -> list[str]:
     """Whether a window's borders, which see next to nothing of the inset, read what the known
-    surround says; and whether cells deviate from those in the rows beside them in the views of even
+    exterior says; and whether cells deviate from those in the rows beside them in the views of even
     and of odd number alike, as gains do and noise does not."""
     window = scan.window
     assert window is not None
-    lines = window.less(scan.line_integrals(), scan.surround_line_integrals()).double()
+    lines = window.less(scan.line_integrals(), scan.exterior_line_integrals()).double()
     if lines.ndim != 3 or lines.shape[-1] < 4 * _BORDER or lines.shape[0] < _FEWEST_VIEWS:
         return []
     found = []
@@ -419,13 +419,13 @@ def _surround_texts(scan: Scan) -> list[str]:
         least = min(
             float(np.quantile(sign * ratio - _BLOCK_SIGMAS * error, 0.7)) for ratio, error in off
         )
-        if least > _SURROUND_TOLERANCE:
+        if least > _EXTERIOR_TOLERANCE:
             size = 100.0 * np.mean([np.quantile(sign * ratio, 0.7) for ratio, _ in off])
             found.append(
                 f"beside the inset the readings of a third of the views or more lie {size:.2g} % "
-                f"{side} those of the known surround: they hold something else than the "
+                f"{side} those of the known exterior: they hold something else than the "
                 "transmission (a dark signal, scatter, pile-up, saturation), or exposure or "
-                "surround are not those of the scan; values are off by a smooth background"
+                "exterior are not those of the scan; values are off by a smooth background"
             )
     gain = _gain_spread(lines, window.column_indices)
     if gain > _GAIN_TOLERANCE:
@@ -438,12 +438,12 @@ def _surround_texts(scan: Scan) -> list[str]:
 
 
 def _border_deviation(scan: Scan, part: slice) -> tuple[Floats, Floats]:
-    """Relative deviation of the columns ``part`` of a window from the surround in blocks of views,
+    """Relative deviation of the columns ``part`` of a window from the exterior in blocks of views,
     and its standard error from the scatter of the views: ratios of sums, which have no bias of a
     logarithm."""
     assert scan.window is not None
-    assert scan.surround is not None
-    expected = scan.window.take(scan.surround)[..., part].double()
+    assert scan.exterior is not None
+    expected = scan.window.take(scan.exterior)[..., part].double()
     if scan.flux is not None:
         expected = expected * scan.flux.double()[:, None, None]
     read = scan.counts[..., part].double()

@@ -1,7 +1,7 @@
 """FBP of a small inset from a scan: filter once, backproject onto any number of grids.
 
-A windowed scan is split by linearity: its surround, the same in every view and noise free, is
-filtered once; the difference of each realisation to the surround is zero outside the window and is
+A windowed scan is split by linearity: its exterior, the same in every view and noise free, is
+filtered once; the difference of each realisation to the exterior is zero outside the window and is
 filtered from the window alone. The sum equals the FBP of the whole rows.
 """
 
@@ -29,8 +29,8 @@ from torchpcct.volume import to_hu
 __all__ = ["InsetFbp", "static_fbp", "view_motion"]
 
 
-SAME_SURROUND = 1e-4
-"""Difference of line integrals up to which two surrounds are one: rounding of float32 stays below
+SAME_EXTERIOR = 1e-4
+"""Difference of line integrals up to which two exteriors are one: rounding of float32 stays below
 1e-5, and behind 24 cm of fat it is worth 0.02 HU."""
 
 
@@ -86,31 +86,31 @@ def require_inside(inner: DetectorWindow, window: DetectorWindow) -> None:
         )
 
 
-def require_same_surround(scan: Scan, lines: Tensor) -> None:
-    """Refuse a scan whose surround is not that of ``lines``, its line integrals ``(rows,
+def require_same_exterior(scan: Scan, lines: Tensor) -> None:
+    """Refuse a scan whose exterior is not that of ``lines``, its line integrals ``(rows,
     columns)`` (ValueError)."""
-    own = scan.surround_line_integrals()
-    if own.shape != lines.shape or not float((own - lines.to(own)).abs().max()) <= SAME_SURROUND:
+    own = scan.exterior_line_integrals()
+    if own.shape != lines.shape or not float((own - lines.to(own)).abs().max()) <= SAME_EXTERIOR:
         raise ValueError(
-            "this scan has another surround (or water correction) than the scan that this was "
+            "this scan has another exterior (or water correction) than the scan that this was "
             "made for: reconstruct scans of different objects or scanners one by one"
         )
 
 
 class InsetFbp:
-    """FBP of one or several grids from scans that share geometry, window and surround.
+    """FBP of one or several grids from scans that share geometry, window and exterior.
 
     A counting-mode scan is reconstructed in HU: call the object with it. A stack of parallel or
     fan-beam slices needs 3-D grids with as many voxels along z. Rows that end inside the object are
     continued by water (:func:`recon.analytic.coverage.consistency_warnings` says so). Channels of
     line integrals (energy bins, basis materials) on the scan's window go to :meth:`images`.
 
-    The split of the readings also compensates motion: the surround stands still while the inset
-    moves, so the surround is backprojected at rest, the difference with the grid displaced in every
+    The split of the readings also compensates motion: the exterior stands still while the inset
+    moves, so the exterior is backprojected at rest, the difference with the grid displaced in every
     view, and the sum shows the inset at rest. Backprojecting whole readings with the displacement
     would move the patient's body with the vessel. The difference of the logarithms is linear in the
     inset up to beam hardening (the inset is seen through the same fat everywhere) and in the
-    surround up to the fat that the inset displaces, which moves with it as part of the difference.
+    exterior up to the fat that the inset displaces, which moves with it as part of the difference.
 
     Attributes:
         circle: the geometry that is filtered: that of the scan, or the ideal circle next to one
@@ -121,16 +121,16 @@ class InsetFbp:
         scan: any scan of the family; its noise does not matter.
         grids: ``(z, y, x)`` grids inside the field of view.
         kernels: reconstruction kernels.
-        surround: line integrals of every cell outside the window, the same in all views:
+        exterior: line integrals of every cell outside the window, the same in all views:
             ``(channels, rows, columns)`` for channels; None: ``(rows, columns)`` of the
             counting-mode scan.
         motion: displacement of the inset in every view, ``(views, 3)`` z, y, x mm
             (:func:`view_motion`); None: at rest.
 
     Raises:
-        ValueError: a spectral scan without ``surround``; a grid outside the field of view or the
-            scan's window; an unknown kernel; a surround of a wrong shape, or motion, in a scan that
-            was acquired without ``region`` (its surround is not known).
+        ValueError: a spectral scan without ``exterior``; a grid outside the field of view or the
+            scan's window; an unknown kernel; an exterior of a wrong shape, or motion, in a scan
+            that was acquired without ``region`` (its exterior is not known).
     """
 
     @checked
@@ -140,10 +140,10 @@ class InsetFbp:
         grids: Sequence[VolumeGrid],
         kernels: Sequence[str],
         *,
-        surround: Tensor | None = None,
+        exterior: Tensor | None = None,
         motion: object = None,
     ) -> None:
-        if surround is None and scan.counts.ndim != 3 and scan.geometry.has_rows:
+        if exterior is None and scan.counts.ndim != 3 and scan.geometry.has_rows:
             raise ValueError(
                 "FBP in HU needs a counting-mode scan; decompose the energy bins, or sum them "
                 "with weights, before: scan.weighted(bin_weights(scanner, …))"
@@ -156,11 +156,11 @@ class InsetFbp:
         self.grids, self.kernels = tuple(grids), tuple(kernels)
         if scan.window is None and motion is not None:
             raise ValueError(
-                "motion compensation needs the surround at rest: acquire the scan with region="
+                "motion compensation needs the exterior at rest: acquire the scan with region="
             )
-        if scan.window is None and surround is not None:
+        if scan.window is None and exterior is not None:
             raise ValueError(
-                "a scan of the whole detector has no surround: acquire it with region="
+                "a scan of the whole detector has no exterior: acquire it with region="
             )
         self.motion = motion
         self.circle, path = self.geometry, motion
@@ -182,12 +182,12 @@ class InsetFbp:
         ]
         self.footprint = DetectorWindow.union(windows, self.geometry.columns)
         require_inside(self.footprint, scan.window)
-        self._lines = scan.surround_line_integrals() if surround is None else surround
-        self._of_scan = surround is None
+        self._lines = scan.exterior_line_integrals() if exterior is None else exterior
+        self._of_scan = exterior is None
         cells = self.geometry.shape[1:]
         if tuple(self._lines.shape[-2:]) != cells:
             raise ValueError(
-                f"surround must have the shape (channels, {cells[0]}, {cells[1]}), got "
+                f"exterior must have the shape (channels, {cells[0]}, {cells[1]}), got "
                 f"{tuple(self._lines.shape)}"
             )
         self.plan = FbpPlan(self.geometry, self.grids, self.kernels, window=self.footprint)
@@ -199,7 +199,7 @@ class InsetFbp:
             )
         )
         # (kernels, [channels,] views, rows, columns) on the grids' footprint.
-        self._surround = self.plan.filtered_static(self._lines)
+        self._exterior = self.plan.filtered_static(self._lines)
 
     def _require_slices(self, scan: Scan) -> None:
         if self.geometry.has_rows:
@@ -215,8 +215,8 @@ class InsetFbp:
 
     @cached_property
     def _rest(self) -> list[Tensor]:
-        """The surround on every grid, per mm."""
-        return self.plan.backprojected(self._surround)
+        """The exterior on every grid, per mm."""
+        return self.plan.backprojected(self._exterior)
 
     @undisturbed
     def images(self, lines: Tensor, outside: float | None = None) -> list[Tensor]:
@@ -248,17 +248,17 @@ class InsetFbp:
         difference = self.window.less(lines, self._lines.to(lines.dtype))
         filtered = self.plan.filtered(difference, held=self.window)
         if self.moving is self.plan:
-            filtered = filtered + self._over_batch(self._surround.to(lines.dtype), filtered)
+            filtered = filtered + self._over_batch(self._exterior.to(lines.dtype), filtered)
             return self.plan.backprojected(filtered)
         moving = self.moving.backprojected(filtered)
         return [self._over_batch(rest, m) + m for rest, m in zip(self._rest, moving, strict=True)]
 
     @staticmethod
-    def _over_batch(surround: Tensor, like: Tensor) -> Tensor:
+    def _over_batch(exterior: Tensor, like: Tensor) -> Tensor:
         """``(kernels, *rest)`` with axes of length 1 where ``like`` has its batch, after the
         kernels."""
-        return surround.reshape(
-            len(surround), *[1] * (like.ndim - surround.ndim), *surround.shape[1:]
+        return exterior.reshape(
+            len(exterior), *[1] * (like.ndim - exterior.ndim), *exterior.shape[1:]
         )
 
     @undisturbed
@@ -271,6 +271,6 @@ class InsetFbp:
         if scan.window != self.window:
             raise ValueError("this scan has another window than the one that InsetFbp was made for")
         if self._lines is not None and self._of_scan:
-            require_same_surround(scan, self._lines)
+            require_same_exterior(scan, self._lines)
         water = self.linearisation.mu_ref
         return [to_hu(v, water) for v in self.images(scan.line_integrals(), water)]

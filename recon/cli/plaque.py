@@ -64,7 +64,7 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         others[method.upper()] = reconstruct(scan, grid, method, progress=progress.of(method)).data
     progress.close()
     deviations = {}
-    if scan.window is not None and scan.surround is not None:
+    if scan.window is not None and scan.exterior is not None:
         deviations["soft FBP"] = fbp_deviations(scan, grid, reading.regions)
     files = save(reading, folder, others, deviations)
     print(table(reading, others, deviations))

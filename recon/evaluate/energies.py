@@ -162,7 +162,7 @@ class EnergyRealisations(Realisations):
             clean,
             counts=readings,
             air=clean.air * scale,
-            surround=None if clean.surround is None else clean.surround * scale,
+            exterior=None if clean.exterior is None else clean.exterior * scale,
             exposure_s=float(exposure_s),
             seed=summed.seed,
         )

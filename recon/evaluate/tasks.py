@@ -607,9 +607,9 @@ def _about_middle(grid: VolumeGrid, inset: VolumeGrid) -> VolumeGrid:
 
 def without_inset(scan: Scan) -> Scan:
     """The scan of what surrounds the inset alone."""
-    assert scan.surround is not None
+    assert scan.exterior is not None
     assert scan.window is not None
-    return replace(scan, counts=scan.window.take(scan.surround).to(scan.counts))
+    return replace(scan, counts=scan.window.take(scan.exterior).to(scan.counts))
 
 
 def with_painted(scan: Scan, inset: VolumeGrid, painted: Callable[[VolumeGrid], Floats]) -> Scan:

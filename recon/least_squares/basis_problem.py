@@ -27,14 +27,14 @@ from torch import Tensor
 
 from recon.analytic.inset import static_fbp
 from recon.gram.gram import Gram
+from recon.least_squares.exterior import length_unit
 from recon.least_squares.pwls import PwlsOptions, mean_weights, pwls
 from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
-from recon.least_squares.surround import length_unit
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import Scan
-from torchpcct.spectral import SpectralModel, cramer_rao, decompose_surround, inverse, vmi_weights
+from torchpcct.spectral import SpectralModel, cramer_rao, decompose_exterior, inverse, vmi_weights
 from torchpcct.validate import number
 
 if TYPE_CHECKING:
@@ -136,9 +136,9 @@ class BasisProblem:
     Args:
         scan: windowed spectral scan; its noise does not matter.
         model: of its scanner and exposure.
-        grid: ``(z, y, x)`` grid that holds everything the surround does not.
+        grid: ``(z, y, x)`` grid that holds everything the exterior does not.
 
-    The Fisher information of every ray is that of the expected counts behind the SURROUND:
+    The Fisher information of every ray is that of the expected counts behind the EXTERIOR:
     information from the noisy counts would bias the result, and a small inset changes it by a few
     per cent only.
 
@@ -148,7 +148,7 @@ class BasisProblem:
     """
 
     def __init__(self, scan: Scan, model: SpectralModel, grid: VolumeGrid) -> None:
-        background = decompose_surround(scan, model)
+        background = decompose_exterior(scan, model)
         scale = torch.from_numpy(model.row_factor)[:, None]
         information = inverse(cramer_rao(background.double(), model, scale=scale))
         self.grid, self.geometry = grid, scan.geometry

@@ -74,7 +74,7 @@ def require_device(scan: Scan, device: torch.device) -> None:
 def is_whole_field(scan: Scan, grid: VolumeGrid) -> bool:
     """Whether PWLS treats the grid as the whole field: always but for an inset of a cone beam."""
     geometry = scan.geometry
-    if scan.surround is not None:
+    if scan.exterior is not None:
         return False
     if not isinstance(geometry, ConeBeam):
         return True  # an inset of a scan given view by view is solved on all that its rays cross
@@ -88,7 +88,7 @@ class FieldProblem:
     """What scans of one geometry share on one grid.
 
     Args:
-        scan: without a known surround; counting, or energy integrating with ``quantum``. Its own
+        scan: without a known exterior; counting, or energy integrating with ``quantum``. Its own
             readings, smoothed, give the weights (:meth:`torchpcct.Scan.weights`): dead readings
             weigh nothing.
         grid: ``(z, y, x)``; of a parallel or fan beam ``(y, x)`` or ``(slices, y, x)``.

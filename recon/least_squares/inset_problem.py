@@ -13,15 +13,15 @@ import torch
 from torch import Tensor
 
 from recon.analytic.coverage import check_rows
-from recon.analytic.inset import require_inside, require_same_surround, static_fbp
+from recon.analytic.inset import require_inside, require_same_exterior, static_fbp
 from recon.data_term import Projected, Quadratic
 from recon.gram.gram import Gram
+from recon.least_squares.exterior import UnknownExterior, length_unit
 from recon.least_squares.field_model import FieldModel
 from recon.least_squares.field_problem import is_whole_field, require_device
 from recon.least_squares.memory import require_memory
 from recon.least_squares.pwls import MinimiseOptions, PwlsOptions, data_model, minimise
 from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
-from recon.least_squares.surround import UnknownSurround, length_unit
 from recon.result import RESIDUAL_TEST, Result, tested
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import VolumeGrid
@@ -45,8 +45,8 @@ class InsetProblem:
     Args:
         scan: a scan of the family of one channel, counts or weighted bins; its noise does not
             matter. A scan of the whole
-            detector without a known surround serves too: what lies around the grid is then found
-            from its own readings, scan by scan (:mod:`recon.least_squares.surround`). Of a grid
+            detector without a known exterior serves too: what lies around the grid is then found
+            from its own readings, scan by scan (:mod:`recon.least_squares.exterior`). Of a grid
             that holds the whole field of view see
             :class:`recon.least_squares.field_problem.FieldProblem`.
         grid: ``(z, y, x)`` grid that holds everything the background does not.
@@ -86,19 +86,19 @@ class InsetProblem:
         self.device = scan.device
         self.warnings: list[str] = []
         self._nodes = nodes
-        self._around: UnknownSurround | None = None
+        self._exterior: UnknownExterior | None = None
         self._background: Tensor | None = None
         self.model: Gram | FieldModel
         exposure = scan.exposure_s or NOISE_FREE_EXPOSURE_S
-        if scan.surround is None:
+        if scan.exterior is None:
             self._start_unknown(scan, exposure)
             return
         require_inside(footprint(scan.geometry, grid, margin=1), self.outer)
-        self._background = scan.surround_line_integrals()
+        self._background = scan.exterior_line_integrals()
         # The background's own value inside the inset, from the same data by FBP.
         self.level = float(static_fbp(self._background, scan.geometry, grid).mean())
         # Per second of exposure: the Gram of one exposure serves all by a factor.
-        self._cell_weights = scan.surround_weights() / exposure
+        self._cell_weights = scan.exterior_weights() / exposure
         self._place(None)
 
     def _start_unknown(self, scan: Scan, exposure: float) -> None:
@@ -114,9 +114,9 @@ class InsetProblem:
         self.weights = self.outer.crop(scan.weights(), self.window) / exposure
         self.projector = Projector(geometry, grid, self.window)
         self.model = data_model(self.projector, self.weights, nodes=self._nodes)
-        self._around = UnknownSurround(geometry, grid, self.window, self.projector)
+        self._exterior = UnknownExterior(geometry, grid, self.window, self.projector)
         try:
-            self.level = self._around.level(scan.line_integrals())
+            self.level = self._exterior.level(scan.line_integrals())
         except ValueError as error:
             raise ValueError(
                 "what lies around this inset is not known, and has to be found by FBP of the "
@@ -143,7 +143,7 @@ class InsetProblem:
     @property
     def prior(self) -> QGGMRF:
         """The default one, :data:`recon.least_squares.qggmrf.DEFAULT_PRIOR` in the length unit of
-        the scan (:func:`recon.least_squares.surround.length_unit`): on the paper's scanner 0.75
+        the scan (:func:`recon.least_squares.exterior.length_unit`): on the paper's scanner 0.75
         line pairs per mm."""
         return DEFAULT_PRIOR.stretched(length_unit(self.geometry), self.grid.ndim)
 
@@ -175,11 +175,11 @@ class InsetProblem:
                 (:func:`recon.analytic.inset.view_motion`); None: at rest.
 
         Raises:
-            ValueError: the surround is not known.
+            ValueError: the exterior is not known.
         """
         if self._background is None:
             raise ValueError(
-                "motion compensation needs the surround at rest: acquire the scan with region="
+                "motion compensation needs the exterior at rest: acquire the scan with region="
             )
         check_rows(self.geometry, self.grid, motion)
         other = copy.copy(self)
@@ -197,11 +197,11 @@ class InsetProblem:
                 "this scan has another geometry or window than the one the problem was made for"
             )
         require_device(scan, self.device)
-        if self._around is not None:
-            return self._around.take_off(scan.line_integrals(), self.level)
+        if self._exterior is not None:
+            return self._exterior.take_off(scan.line_integrals(), self.level)
         if self._background is None:
             return self.outer.crop(scan.line_integrals(), self.window)
-        require_same_surround(scan, self._background)
+        require_same_exterior(scan, self._background)
         # The logarithm is taken of the footprint alone; the interpolation of dead readings needs
         # their neighbours.
         near = scan if scan.dead is not None or scan.window is None else scan.crop(self.window)

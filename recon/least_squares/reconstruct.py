@@ -41,7 +41,7 @@ def reconstruct_pwls(
         grid: the inset, or the field.
         progress: called with the finished fraction.
         prior: None: :data:`recon.least_squares.qggmrf.DEFAULT_PRIOR` in the length unit of the scan
-            (:func:`recon.least_squares.surround.length_unit`); of a whole field
+            (:func:`recon.least_squares.exterior.length_unit`); of a whole field
             :func:`recon.least_squares.field_problem.field_prior`. Neither depends on the unit of
             length.
         problem: kept from an earlier call with the same scan and grid; None: made here.

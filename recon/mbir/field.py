@@ -11,7 +11,7 @@ Four things differ from an inset (:mod:`recon.mbir.mbir`):
   (across the shoulders, along a rib), so that spectrum is averaged over the directions in plane:
   where it is small in a direction and the true one is not, a step towards the data would be mostly
   noise.
-* What the inset's surround is there, a strongly regularised PWLS is here: it takes the body's
+* What the inset's exterior is there, a strongly regularised PWLS is here: it takes the body's
   outline, bones and lungs off the data, and the network sees the rest, as in training. It need not
   converge, the data decide about the sum.
 * The network sees blocks that overlap, each with its own noise scale as condition.
@@ -67,14 +67,14 @@ BLOCK = 64
 """Voxels along each axis that a block of the network gives."""
 HALO = 16
 """Voxels on each side of it that help only, or fade."""
-SURROUND_STRENGTH = 10.0
+EDGES_STRENGTH = 10.0
 """Strength of the PWLS that takes off the edges, over that of the default prior."""
-SURROUND_STEP_HU = 75.0
+EDGES_STEP_HU = 75.0
 """Step from voxel to voxel above which it is an edge, HU. A threshold that follows the noise would
 leave a starved scan the outline of the body."""
-SURROUND_HU = 5.0
+EDGES_TOLERANCE_HU = 5.0
 """Tolerance of that PWLS, HU."""
-SURROUND_PAIRS = 60
+EDGES_PAIRS = 60
 """Its projection pairs at most."""
 
 
@@ -261,7 +261,7 @@ class Field:
     """Scans of one geometry on one grid of a whole field, for MBIR.
 
     Args:
-        scan: without a known surround.
+        scan: without a known exterior.
         grid: ``(z, y, x)``; of a parallel or fan beam ``(y, x)`` or ``(slices, y, x)``.
         network: with its weights.
 
@@ -303,8 +303,8 @@ class Field:
         require_memory(problem.projector, 1, slices[0][0], None)
         with torch.no_grad():
             gram = FieldGram(problem, [w for _, w in slices], network.voxel_mm)
-            around = _surround(problem, slices)
-            normal = network.normal(_term(problem, slices, gram, around, network.voxel_mm))
+            edges = _edges(problem, slices)
+            normal = network.normal(_term(problem, slices, gram, edges, network.voxel_mm))
             scales = normal.unit_hu * gram.ratio
             # Its noise is known on average over directions only: along a starved one, noise would
             # pass for structure, so nothing is put back.
@@ -312,10 +312,10 @@ class Field:
             u = network.with_prior(partial(blockwise, prior, scales)).solution(
                 normal, restore=False, solves=SOLVES
             )
-            taken = _stacked(problem, around)[None] / (scales * normal.mu_per_hu)
+            taken = _stacked(problem, edges)[None] / (scales * normal.mu_per_hu)
             rest = (u[0] * scales) * normal.mu_per_hu
             parts = rest if problem.plane else [rest]
-            mu = [x + d for x, d in zip(around, parts, strict=True)]
+            mu = [x + d for x, d in zip(edges, parts, strict=True)]
             volume, report, _, _ = network.results(
                 normal, u, problem.hu(mu)[None], normal.left(u), whole=normal.less(-taken)
             )[0]
@@ -352,13 +352,13 @@ def _term(
     problem: FieldProblem,
     slices: Sequence[tuple[Tensor, Tensor]],
     gram: FieldGram,
-    around: Sequence[Tensor],
+    edges: Sequence[Tensor],
     voxel_mm: float,
 ) -> Quadratic:
     """The data term of what is to be added to the edges, for volumes that are divided by s."""
     A = problem.projector
     energies, parts = [], []
-    for (y, w), x in zip(slices, around, strict=True):  # the readings of one slice at a time
+    for (y, w), x in zip(slices, edges, strict=True):  # the readings of one slice at a time
         rest = y - A(x)
         weighed = w * rest
         energies.append((weighed * rest).sum(dtype=torch.float64))
@@ -391,15 +391,15 @@ def _onto(hu: Tensor, source: VolumeGrid, target: VolumeGrid) -> Tensor:
     return average_onto(hu.unsqueeze(-3), source3, target3).squeeze(-3)
 
 
-def _surround(problem: FieldProblem, slices: Sequence[tuple[Tensor, Tensor]]) -> list[Tensor]:
-    """The edges of each slice in mm⁻¹: PWLS with :data:`SURROUND_STRENGTH` times the strength of
+def _edges(problem: FieldProblem, slices: Sequence[tuple[Tensor, Tensor]]) -> list[Tensor]:
+    """The edges of each slice in mm⁻¹: PWLS with :data:`EDGES_STRENGTH` times the strength of
     the default prior."""
     voxel = problem.work.spacing[-1]
     usual = field_prior(voxel, problem.work.ndim)
     prior = replace(
         usual,
-        strength=SURROUND_STRENGTH * usual.strength,
-        threshold=SURROUND_STEP_HU / voxel,
+        strength=EDGES_STRENGTH * usual.strength,
+        threshold=EDGES_STEP_HU / voxel,
         relative=False,
     )
     hu = problem.mu_ref / 1000.0
@@ -412,8 +412,8 @@ def _surround(problem: FieldProblem, slices: Sequence[tuple[Tensor, Tensor]]) ->
             prior,
             mu_per_hu=hu,
             start=problem.start(y),
-            tolerance=SURROUND_HU,
-            max_exact=SURROUND_PAIRS,
+            tolerance=EDGES_TOLERANCE_HU,
+            max_exact=EDGES_PAIRS,
         )
         found.append(result.volume)
     return found

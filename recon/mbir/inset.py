@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from recon.data_term import Quadratic
+from recon.least_squares.exterior import CELL_MM, length_unit
 from recon.least_squares.inset_problem import InsetProblem
-from recon.least_squares.surround import CELL_MM, length_unit
 from recon.mbir.mbir import Mbir, average_onto, working_grid
 from recon.result import RESIDUAL_TEST, Result, tested
 from torchpcct.geometry import VolumeGrid

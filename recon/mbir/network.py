@@ -9,11 +9,11 @@ Simoncelli, Fernandez-Granda 2020, ICLR: bias-free networks generalise over nois
 it must know, the noise scale in HU (tissues have their HU), the fidelity and the step, changes
 gains of its channels only.
 
-A homogeneous network shrinks what it is unsure of towards 0, and 0 is the value of the surround
-unless ``local_mm`` is given: then the network works on differences from a Gaussian mean about each
-voxel, and a constant that is added to the volume passes through, so that all tissues are alike to
-it. With ``turns`` the result is the mean over quarter turns and mirror images about z, and a scene
-that is turned gives the turned volume.
+A homogeneous network shrinks what it is unsure of towards 0, and 0 is the level that the volume is
+counted from (the fat about a vessel) unless ``local_mm`` is given: then the network works on
+differences from a Gaussian mean about each voxel, and a constant that is added to the volume passes
+through, so that all tissues are alike to it. With ``turns`` the result is the mean over quarter
+turns and mirror images about z, and a scene that is turned gives the turned volume.
 
 Blocks of 2 × 2 × 2 voxels become channels first (Shi et al. 2016, CVPR, sub-voxel convolution), two
 more halvings follow (Ronneberger, Fischer, Brox 2015, U-Net): at 0.2 mm the coarsest cells have 1.6
@@ -65,7 +65,7 @@ class NetworkConfig:
         channels: of the three levels.
         voxel_mm: size of the cubic voxels that it is for.
         local_mm: standard deviation of the Gaussian mean that it works relative to, mm; 0: relative
-            to the surround.
+            to the level that the volume is counted from.
         bilateral: a third view of the data: the step towards them through a joint bilateral filter,
             twice (:mod:`recon.mbir.bilateral`), to which the network adds what the filter has taken
             away.

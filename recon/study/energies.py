@@ -30,8 +30,8 @@ from torchpcct.spectral import (
     SpectralModel,
     bin_weights,
     cramer_rao,
+    decompose_exterior,
     decompose_scan,
-    decompose_surround,
     vmi_curve,
     weighting_gain,
 )
@@ -194,6 +194,6 @@ def _basis_noise(
     """Covariances ``(pairs, pairs, 3)`` at 1 s of the functionals of FBP of the basis images, from
     readings decomposed at their Cramér–Rao bound."""
     columns, scale = model.cells(bins)
-    fbp = InsetFbp(bins, [task.grid], [kernel], surround=decompose_surround(bins, model))
+    fbp = InsetFbp(bins, [task.grid], [kernel], exterior=decompose_exterior(bins, model))
     rays = cramer_rao(lines, model, columns=columns, scale=scale).float()
     return functional_covariance(fbp, torch.stack(functionals).float(), rays)

@@ -25,26 +25,26 @@ def fbp_deviations(
     noise alone.
 
     One adjoint pass a region (:mod:`recon.analytic.exact_noise`), with the variance of the readings
-    that is expected behind the known surround: what the inset adds to the attenuation, a few per
+    that is expected behind the known exterior: what the inset adds to the attenuation, a few per
     cent of the counts, is left out, and so is that the regions were found in the same noise.
 
     Args:
-        scan: windowed, its surround known, noisy or noise free (then of the exposure its readings
+        scan: windowed, its exterior known, noisy or noise free (then of the exposure its readings
             stand for).
         grid: of the regions.
         regions: name → shares of the voxels, as :attr:`recon.vessel.reading.PlaqueReading.regions`.
 
     Raises:
-        ValueError: a scan of the whole detector, or of an unknown surround.
+        ValueError: a scan of the whole detector, or of an unknown exterior.
     """
-    if scan.window is None or scan.surround is None:
+    if scan.window is None or scan.exterior is None:
         raise ValueError(
-            "the noise of regions needs a scan whose surround is known: acquire it with region="
+            "the noise of regions needs a scan whose exterior is known: acquire it with region="
         )
     masks = core_regions(regions)
     fbp = InsetFbp(scan, [grid], ["soft"])
-    slope = scan.linearisation.slope(scan.air.log() - scan.surround.log())
-    variance = slope.square() / scan.surround
+    slope = scan.linearisation.slope(scan.air.log() - scan.exterior.log())
+    variance = slope.square() / scan.exterior
     pair = [n for n in masks if n in ("fibrous", "core")]
     # The vectors are large: no more than two at a time.
     groups: list[list[str]] = [pair] if pair else []

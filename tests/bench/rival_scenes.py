@@ -137,7 +137,7 @@ class Bench:
         p, window = self.problem, self.clean.window
         added = torch.from_numpy(above_fat * (p.mu_ref / 1000.0)).float()
         lines = Projector(p.geometry, self.fine, window)(added)
-        images = self.fbp.images(lines + window.take(self.clean.surround_line_integrals()))[0]
+        images = self.fbp.images(lines + window.take(self.clean.exterior_line_integrals()))[0]
         b = p.projector.T(p.weights * p.outer.crop(lines, p.window))
         return to_hu(images, p.mu_ref), b
 

@@ -9,7 +9,7 @@ from small_scan import GRID, SCENE, SPECTRAL_GRID, scanner
 from recon.cli import main
 from recon.least_squares.inset_problem import InsetProblem
 from torchpcct import acquire
-from torchpcct.spectral import SpectralModel, decompose_scan, decompose_surround
+from torchpcct.spectral import SpectralModel, decompose_exterior, decompose_scan
 
 
 @pytest.fixture(scope="session")
@@ -25,7 +25,7 @@ def problem(clean):
 @pytest.fixture(scope="session")
 def spectral():
     """A noise-free spectral scan of the ball, its model, line integrals and those of the
-    surround."""
+    exterior."""
     s = scanner("spectral", rows=10)
     clean, model = (
         acquire(SCENE, s, region=SPECTRAL_GRID, duty=0.06, sub_rays=16),
@@ -35,7 +35,7 @@ def spectral():
         clean,
         model,
         decompose_scan(clean, model).line_integrals,
-        decompose_surround(clean, model),
+        decompose_exterior(clean, model),
     )
 
 

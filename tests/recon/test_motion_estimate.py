@@ -249,18 +249,18 @@ def test_voxels_are_no_larger_than_cells(moving):
 
 def test_refusals(moving):
     counts = torch.ones(moving.geometry.shape)
-    whole = replace(moving, window=None, surround=None, region=None, counts=counts)
+    whole = replace(moving, window=None, exterior=None, region=None, counts=counts)
     fan = FanBeam(full_turn(60), 40.0, 60.0, 48, 0.4)
     flat = Scan.from_line_integrals(torch.zeros(fan.shape), fan, photons=1e4, mu_water=0.02)
     few = moving.select(slice(0, None, 2))
     refused(
-        ("surround cannot both be found", lambda: estimate_motion(whole, GRID)),
+        ("exterior cannot both be found", lambda: estimate_motion(whole, GRID)),
         ("at least 48 views", lambda: estimate_motion(few, GRID)),
         ("cone beam on a circle", lambda: estimate_motion(flat, GRID)),
         ("needs rotation_s", lambda: estimate_motion(moving, GRID, heart_rate=60.0)),
         ("give both", lambda: estimate_motion(moving, GRID, rotation_s=0.35)),
         ("must be a Scan", lambda: estimate_motion(torch.zeros(3), GRID)),  # type: ignore[arg-type]
         ('"estimate" or', lambda: recon.reconstruct(moving, GRID, motion="guess")),
-        ("surround of the inset", lambda: recon.reconstruct(whole, GRID, motion="estimate")),
+        ("exterior of the inset", lambda: recon.reconstruct(whole, GRID, motion="estimate")),
         (r"\(48, 3\)", lambda: recon.reconstruct(moving, GRID, motion=np.zeros((47, 3)))),
     )

@@ -141,11 +141,11 @@ def test_few_views_are_named(clean):
 
 
 @pytest.mark.parametrize("method", ["fbp", "pwls"])
-def test_scans_of_other_objects_are_not_reconstructed_with_the_first_ones_surround(clean, method):
-    """A slightly larger patient: with the first patient's surround it was 35 HU off."""
+def test_scans_of_other_objects_are_not_reconstructed_with_the_first_ones_exterior(clean, method):
+    """A slightly larger patient: with the first patient's exterior it was 35 HU off."""
     large = Scene([Body("patient", EllipticCylinder(124.0), "pericoronary_fat"), *SCENE.bodies[1:]])
     other = acquire(large, scanner(), region=GRID, duty=0.06, sub_rays=16)
-    with pytest.raises(ValueError, match="another surround"):
+    with pytest.raises(ValueError, match="another exterior"):
         reconstruct([clean, other], GRID, method)
     reconstruct([clean.with_noise(2.0, 0), clean.with_noise(2.0, 1)], GRID, "fbp")
 
@@ -277,16 +277,16 @@ def test_fbp_of_a_wrong_rotation_centre_is_named(clean):
     [
         (
             lambda n, air, gain: n * torch.exp(0.1 - 0.1 * n / air),
-            "above those of the known surround",
+            "above those of the known exterior",
         ),
-        (lambda n, air, gain: n + 0.001 * air, "above those of the known surround"),
-        (lambda n, air, gain: n.clamp(max=float(n.mean())), "below those of the known surround"),
+        (lambda n, air, gain: n + 0.001 * air, "above those of the known exterior"),
+        (lambda n, air, gain: n.clamp(max=float(n.mean())), "below those of the known exterior"),
         (lambda n, air, gain: n * gain, "gains that the calibration in air did not see"),
         (lambda n, air, gain: n, ""),
     ],
     ids=["pile-up", "dark signal", "saturation", "gains", "sound"],
 )
-def test_a_window_that_does_not_read_its_surround_is_named(clean, change, expected_text):
+def test_a_window_that_does_not_read_its_exterior_is_named(clean, change, expected_text):
     """FBP of an inset took them for the inset's own, 30 to 120 HU off; PWLS and MBIR see them in
     their residual."""
     air = clean._at_window(clean.air)
@@ -298,17 +298,17 @@ def test_a_window_that_does_not_read_its_surround_is_named(clean, change, expect
         found = [
             t
             for t in consistency_warnings(changed.with_noise(4.0, seed), GRID)
-            if "surround" in t or "gains" in t
+            if "exterior" in t or "gains" in t
         ]
         assert len(found) == bool(expected_text)
         assert not expected_text or expected_text in found[0]
 
 
-def test_few_counts_and_lost_readings_do_not_speak_against_the_surround(clean):
+def test_few_counts_and_lost_readings_do_not_speak_against_the_exterior(clean):
     few, scan = clean.with_noise(0.02, 0), clean.with_noise(4.0, 0)
     lost = torch.rand(few.counts.shape, generator=torch.Generator().manual_seed(1)) < 0.1
     for given in (few, replace(scan, counts=scan.counts.masked_fill(lost, 0.0))):
-        assert not [t for t in consistency_warnings(given, GRID) if "surround" in t]
+        assert not [t for t in consistency_warnings(given, GRID) if "exterior" in t]
 
 
 def _noise(sd):

@@ -124,7 +124,7 @@ def windowed():
 
 @pytest.mark.parametrize("k", [1e-3, 1e4])
 def test_insets_of_windowed_scans(windowed, k):
-    """The surround is known; MBIR, whose network knows voxels of 0.2 mm, says so."""
+    """The exterior is known; MBIR, whose network knows voxels of 0.2 mm, says so."""
     grid = VolumeGrid((4, 8, 8), 0.4, CENTER)
     linearisation = replace(windowed.linearisation, mu_ref=windowed.linearisation.mu_ref / k)
     other = replace(windowed, geometry=stretched(windowed.geometry, k), linearisation=linearisation)

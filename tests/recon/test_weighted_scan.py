@@ -20,7 +20,7 @@ def summed(spectral):
     """The plain sum of the bins, as a counting scanner reads it."""
     clean = spectral[0]
     return replace(
-        clean, counts=clean.counts.sum(0), air=clean.air.sum(0), surround=clean.surround.sum(0)
+        clean, counts=clean.counts.sum(0), air=clean.air.sum(0), exterior=clean.exterior.sum(0)
     )
 
 
@@ -42,11 +42,11 @@ def test_pwls_weighs_by_the_second_moment_of_the_sum(spectral, summed):
     assert (problem.weights / exact - 1).abs().max() < 0.1
     # in a ray beside the ball: from the expected counts of the bins
     w = torch.from_numpy(np.asarray(iodine))[:, None]
-    counts = clean.surround.double()
+    counts = clean.exterior.double()
     variance = (w**2 * counts).sum(0) / (w * counts).sum(0) ** 2
-    p = torch.log(scan.air / scan.surround)
+    p = torch.log(scan.air / scan.exterior)
     variance = variance * scan.linearisation.slope(p).double() ** 2
-    found = scan.surround_weights().double() * variance
+    found = scan.exterior_weights().double() * variance
     seen = scan.window.column_indices
     middle = found[:, int(seen.min()) : int(seen.max()) + 1]
     assert (middle - 1).abs().max() < 0.01
@@ -64,7 +64,7 @@ def test_a_measured_scan_knows_what_its_weights_need(spectral):
     clean = spectral[0]
     iodine = bin_weights(SCANNER, ("blood_iodine", "fibrous_tissue"), {"adipose": 240.0})
     noisy = clean.with_noise(0.35, 4).weighted(iodine)
-    found, exact = (s.surround_weights() for s in (noisy, clean.weighted(iodine)))
+    found, exact = (s.exterior_weights() for s in (noisy, clean.weighted(iodine)))
     seen = noisy.window.column_indices
     inside = slice(int(seen.min()), int(seen.max()) + 1)
     assert (found / (0.35 * exact) - 1)[:, inside].abs().max() < 0.05

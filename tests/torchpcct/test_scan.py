@@ -1,5 +1,7 @@
 """Scans: files, logarithms, refusals."""
 
+import copy
+import pickle
 from dataclasses import replace
 
 import h5py
@@ -48,7 +50,7 @@ def whole():
 
 
 def same_scan(a, b):
-    tensors = ("counts", "air", "surround", "quantum", "dead")
+    tensors = ("counts", "air", "exterior", "quantum", "dead")
     plain = (
         "geometry",
         "window",
@@ -105,7 +107,7 @@ def test_files_keep_every_scan(tmp_path, clean, kind):
     scan.save(tmp_path / "scan.h5")
     back = Scan.load(tmp_path / "scan.h5")
     assert same_scan(back, scan)
-    if scan.exposure_s is None and scan.surround is not None:
+    if scan.exposure_s is None and scan.exterior is not None:
         assert torch.equal(back.with_noise(0.7, 1).counts, scan.with_noise(0.7, 1).counts)
     with h5py.File(tmp_path / "scan.h5", "r") as file:
         assert file["counts"].shape == scan.counts.shape
@@ -129,6 +131,39 @@ def test_earlier_foreign_and_newer_files(tmp_path, clean):
         Scan.load(tmp_path / "scan.h5")
     with pytest.raises(FileNotFoundError):
         Scan.load(tmp_path / "none.h5")
+
+
+def test_a_file_of_version_5_holds_the_exterior_under_its_former_name(tmp_path, clean):
+    clean.save(tmp_path / "scan.h5")
+    with h5py.File(tmp_path / "scan.h5", "a") as file:
+        assert set(file["window"]) == {"exterior", "first_column"}
+        assert file.attrs["version"] == 6
+        file.move("window/exterior", "window/surround")
+        file.attrs["version"] = 5
+    seal(tmp_path / "scan.h5")
+    assert same_scan(Scan.load(tmp_path / "scan.h5"), clean)
+
+
+def test_former_names_are_refused_with_the_ones_of_now(clean):
+    for error, former in (
+        (TypeError, lambda: replace(clean, surround=None)),
+        (AttributeError, lambda: clean.surround),
+        (AttributeError, lambda: clean.surround_line_integrals()),
+        (AttributeError, lambda: clean.surround_weights()),
+        (TypeError, lambda: InsetFbp(clean, [], [], surround=None)),
+        (ImportError, lambda: torchpcct.spectral.decompose_surround),
+    ):
+        with pytest.raises(error, match=r"is now called (decompose_)?exterior"):
+            former()
+    with pytest.raises(ImportError, match="is now called decompose_exterior"):
+        from torchpcct.spectral import decompose_surround  # noqa: F401
+    # What never was a name has Python's own error.
+    with pytest.raises(AttributeError, match="'Scan' object has no attribute 'none'"):
+        clean.none  # noqa: B018
+    with pytest.raises(TypeError, match=r"unexpected keyword argument 'none'"):
+        replace(clean, none=None)
+    assert same_scan(pickle.loads(pickle.dumps(clean)), clean)
+    assert same_scan(copy.deepcopy(clean), clean)
 
 
 def test_noise_on_noise_is_refused(clean):
@@ -200,7 +235,7 @@ def test_a_lower_dose_of_a_measured_scan(clean):
     low = [clean.with_noise(0.5, 100 + k) for k in range(24)]
     assert high[0].exposure_s == pytest.approx(0.5)
     torch.testing.assert_close(high[0].air, low[0].air)
-    torch.testing.assert_close(high[0].surround, low[0].surround)
+    torch.testing.assert_close(high[0].exterior, low[0].exterior)
     assert high[0].info["lower_dose"] == {"fraction": 0.25, "seed": 0, "exact": True}
     variance = [
         torch.stack([s.line_integrals() for s in scans]).var(0).mean() for scans in (high, low)

@@ -97,8 +97,8 @@ def test_views_are_those_of_the_method(data):
 
 
 def test_contrasts_are_differences_of_means(data):
-    """Weights of a core add up to 1, of its surround to -1, or all are 0; the number of voxels
-    is the smaller one's."""
+    """Weights of a core add up to 1, of the tissue about it to -1, or all are 0; the number of
+    voxels is the smaller one's."""
     seen = 0
     for step in range(12):
         batch = data.batch(step, BATCH, range(4))

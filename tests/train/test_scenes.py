@@ -225,7 +225,7 @@ def test_data_are_blurred_and_the_truth_is_not() -> None:
 
 
 def test_masks_are_the_contrast() -> None:
-    """Core and surround are the derivatives of the image by the HU of the two tissues."""
+    """Core and tissue about it are the derivatives of the image by the HU of the two."""
     vessel = tube(
         outer=1.68,
         lumen=0.5,

@@ -161,7 +161,7 @@ def acquire(
         symmetric, step = bodies.symmetric(used, one), np.array([bodies.view_step])
         seen = expected_readings(one, DetectorWindow.full(one), symmetric, dense, step)
         known = KnownReadings(plan_, seen.numpy()[:, 0], {})
-    surround = known.surround
+    exterior = known.exterior
     counts = _readings(plan_, bodies, scanner, used, beam, known, progress, keep or _computed)
     remember(key, known)
     info = {
@@ -170,7 +170,7 @@ def acquire(
         "plan": plan_.as_dict(),
         "seconds": round(time.perf_counter() - start, 2),
     }
-    kept = None if plan_.kept is None else surround
+    kept = None if plan_.kept is None else exterior
     scan = detected(scanner, counts, air, energies, info, kept, plan_.kept)
     scan = scan if plan_.kept is None else replace(scan, region=region)
     return scan if exposure_s is None else scan.with_noise(exposure_s, seed)
@@ -200,17 +200,17 @@ def _readings(
 ) -> Tensor:
     """Expected readings ``(bins, views, rows, columns)`` of the kept cells, float32; those of the
     varying bodies join what is ``known``."""
-    g, active, surround = scanner.geometry, plan_.active, known.surround
+    g, active, exterior = scanner.geometry, plan_.active, known.exterior
     kept = plan_.kept or DetectorWindow.full(g)
-    out = torch.empty((len(surround), *kept.shape), dtype=torch.float32)
-    background = torch.from_numpy(surround.astype(np.float32))
+    out = torch.empty((len(exterior), *kept.shape), dtype=torch.float32)
+    background = torch.from_numpy(exterior.astype(np.float32))
 
     def near(views: slice) -> Tensor:
         """What the bodies inside the region change, of the active cells."""
         assert active is not None
         part, step = g.select(views), np.full(views.stop - views.start, bodies.view_step)
         found = expected_readings(
-            part, active.select(views), bodies.at(energies, part), beam, step, surround
+            part, active.select(views), bodies.at(energies, part), beam, step, exterior
         )
         return found.to(torch.float32)
 
@@ -310,7 +310,7 @@ def detected(
     air: Floats,
     energies: Floats,
     info: dict[str, object],
-    surround: Floats | None = None,
+    exterior: Floats | None = None,
     window: DetectorWindow | None = None,
 ) -> Scan:
     """The noise-free scan of expected readings, with what the detector makes of them.
@@ -319,14 +319,14 @@ def detected(
         scanner: whose detector it is.
         counts: ``(bins, views, rows, columns)`` float32, the bins of :func:`signal_spectra`;
             overwritten, as the readings of a whole detector are large.
-        air, surround: ``(bins, rows, columns)``; surround None: of a scan without window.
+        air, exterior: ``(bins, rows, columns)``; exterior None: of a scan without window.
         energies: ``(E,)`` keV.
         info: of the scan.
         window: the part of the detector that ``counts`` hold; None: all of it.
     """
     g, detector, bins = scanner.geometry, scanner.detector, scanner.detector.bins
     bare = torch.from_numpy(np.array(air))
-    behind = None if surround is None else torch.from_numpy(np.array(surround))
+    behind = None if exterior is None else torch.from_numpy(np.array(exterior))
     pile_up = scanner.pile_up()
     if pile_up is not None:
         kept, cells, columns = window or DetectorWindow.full(g), bare, np.arange(g.columns)
@@ -349,7 +349,7 @@ def detected(
         geometry=g,
         linearisation=scanner.water_linearisation(),
         window=window,
-        surround=None if behind is None else of_bins(behind),
+        exterior=None if behind is None else of_bins(behind),
         counting=not detector.energy_integrating,
         info=info,
         quantum=None if quantum is None else of_bins(quantum),

@@ -43,18 +43,18 @@ class KnownReadings(NamedTuple):
 
     Attributes:
         plan: what was modelled.
-        surround: readings of the symmetric bodies.
+        exterior: readings of the symmetric bodies.
         blocks: readings of the varying bodies by the name of the block of views.
     """
 
     plan: Plan
-    surround: Floats
+    exterior: Floats
     blocks: dict[str, Tensor]
 
     @property
     def bytes(self) -> int:
         """Size of the readings."""
-        return sum(block.nbytes for block in self.blocks.values()) + self.surround.nbytes
+        return sum(block.nbytes for block in self.blocks.values()) + self.exterior.nbytes
 
 
 _held: OrderedDict[str, KnownReadings] = OrderedDict()

@@ -273,14 +273,14 @@ def _readings(
     row_factor: Floats,
     first_column: NDArray[np.int64],
     first_row: int,
-    surround: Floats,
+    exterior: Floats,
     out: Floats,
 ) -> None:
     bins, _, rows, columns = out.shape
     rank, energies = basis.shape
     bodies = kinds.size
     count = points.shape[0]
-    has_surround = surround.shape[0] > 0
+    has_exterior = exterior.shape[0] > 0
     # Readings side by side: some columns, and for each of them some rows, which follow each other.
     high = min(rows, _MOST_LANES)
     wide = max(1, _LANES // high)
@@ -309,7 +309,7 @@ def _readings(
         found = 0
         for j in range(columns):
             column = first_column[view] + j
-            if has_surround:
+            if has_exterior:
                 # Distance of the centre ray from the bodies' circle: most readings pass far
                 # outside.
                 lx, ly = across[count, column, 0], across[count, column, 1]
@@ -318,7 +318,7 @@ def _readings(
                 if abs(sx * (lx * sb + ly * cb) - sy * (lx * cb - ly * sb)) > circle[2] + reach:
                     for b in range(bins):
                         for row in range(rows):
-                            out[b, view, row, j] = surround[b, first_row + row, column]
+                            out[b, view, row, j] = exterior[b, first_row + row, column]
                     continue
             seen[found] = j
             found += 1
@@ -403,7 +403,7 @@ def expected_readings(
     bodies: BodySet,
     beam: Beam,
     view_step: Floats,
-    surround: Floats | None = None,
+    exterior: Floats | None = None,
 ) -> Tensor:
     """Expected readings on a window of the detector.
 
@@ -413,7 +413,7 @@ def expected_readings(
         bodies: packed bodies; their first entry moves as the circle does.
         beam: spectra, focal spot and sub-rays.
         view_step: ``(views,)`` rad the gantry turns while a view is read.
-        surround: ``(bins, rows, columns)`` readings of the rays that miss the bodies' circle; None
+        exterior: ``(bins, rows, columns)`` readings of the rays that miss the bodies' circle; None
             computes all.
 
     Returns:
@@ -433,8 +433,8 @@ def expected_readings(
     shaped("contrast", bodies.contrast, (count, energies))
     for name, way in (("offsets", bodies.offsets), ("drift", bodies.drift)):
         shaped(name, way, (count, geometry.views, 3))
-    if surround is not None:
-        shaped("surround", surround, (bins, geometry.rows, geometry.columns))
+    if exterior is not None:
+        shaped("exterior", exterior, (bins, geometry.rows, geometry.columns))
     coefficients, basis = compress(bodies.contrast)
     out = np.empty((len(beam.spectra), *window.shape))
     dv, du = geometry.pitch
@@ -471,7 +471,7 @@ def expected_readings(
         np.ascontiguousarray(beam.row_factor),
         window.first_column,
         window.first_row,
-        empty if surround is None else np.ascontiguousarray(surround),
+        empty if exterior is None else np.ascontiguousarray(exterior),
         out,
     )
     return torch.from_numpy(out)

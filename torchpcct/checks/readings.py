@@ -88,7 +88,7 @@ def reading_warnings(scan: Scan) -> list[str]:
     """What the readings of a noisy scan say against its description.
 
     Args:
-        scan: of any geometry, without energy bins. What was acquired with a known surround is only
+        scan: of any geometry, without energy bins. What was acquired with a known exterior is only
             tested for light and for a lowest value.
 
     Returns:
@@ -143,7 +143,7 @@ def without_light(scan: Scan) -> list[str]:
     if float(quanta.amin()) >= FEWEST:
         return []
     expected = scan._expected(quanta)
-    if scan.surround is None:
+    if scan.exterior is None:
         expected = smoothed(expected, scan.dead, scan.geometry.has_rows)
     share = float((expected < FEWEST).float().mean())
     if share <= STARVED_SHARE:

@@ -171,7 +171,7 @@ def residual_test(
             size, error = (chi2_calm, spread_calm) if above >= below else (chi2, spread)
             findings.append(
                 f"the data differ from the volume by {size:.4g} times their stated noise variance "
-                f"(1 ± {error:.2g} expected): exposure, geometry or surround are not those of the "
+                f"(1 ± {error:.2g} expected): exposure, geometry or exterior are not those of the "
                 "scan, or something outside of the grid was left out"
             )
 

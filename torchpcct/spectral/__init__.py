@@ -8,13 +8,15 @@ integrals of the two). What is made of the two reconstructed images: ``vmi`` (on
 and one channel of line integrals).
 """
 
+from typing import TYPE_CHECKING
+
 from torchpcct.spectral.basis import Basis, pe_pvc
 from torchpcct.spectral.decompose import (
     Decomposition,
     cramer_rao,
     decompose,
+    decompose_exterior,
     decompose_scan,
-    decompose_surround,
     inverse,
 )
 from torchpcct.spectral.mmd import MMD_TISSUES, clean, label, mmd, nearest
@@ -33,6 +35,7 @@ from torchpcct.spectral.weighting import (
     contrast_information,
     weighting_gain,
 )
+from torchpcct.validate import now_called
 
 __all__ = [
     "MMD_TISSUES",
@@ -47,8 +50,8 @@ __all__ = [
     "contrast_information",
     "cramer_rao",
     "decompose",
+    "decompose_exterior",
     "decompose_scan",
-    "decompose_surround",
     "inverse",
     "label",
     "mmd",
@@ -60,3 +63,11 @@ __all__ = [
     "vmi_weights",
     "weighting_gain",
 ]
+
+if not TYPE_CHECKING:  # to mypy every name would exist
+
+    def __getattr__(name: str) -> object:
+        if former := now_called([name]):
+            # Of an AttributeError the statement "from … import" would drop the text.
+            raise ImportError(f"torchpcct.spectral has no {name}{former}")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -31,8 +31,8 @@ __all__ = [
     "Decomposition",
     "cramer_rao",
     "decompose",
+    "decompose_exterior",
     "decompose_scan",
-    "decompose_surround",
     "inverse",
 ]
 
@@ -281,20 +281,20 @@ def decompose_scan(
 
 
 @checked
-def decompose_surround(scan: Scan, model: SpectralModel) -> Tensor:
-    """Line integrals ``(2, rows, columns)`` in mm of a windowed scan's surround, which is noise
+def decompose_exterior(scan: Scan, model: SpectralModel) -> Tensor:
+    """Line integrals ``(2, rows, columns)`` in mm of a windowed scan's exterior, which is noise
     free.
 
     Raises:
         ValueError: the scan is not windowed, has one bin, or does not fit the model.
     """
     _check_spectral(scan)
-    if scan.surround is None:
-        raise ValueError("a full scan has no surround: use decompose_scan()")
+    if scan.exterior is None:
+        raise ValueError("a full scan has no exterior: use decompose_scan()")
     model.cells(scan)
     scale = torch.from_numpy(model.row_factor)[:, None]
     return decompose(
-        scan.surround, model, scale=scale, bias_reduction=False, tolerance=EXACT_TOLERANCE
+        scan.exterior, model, scale=scale, bias_reduction=False, tolerance=EXACT_TOLERANCE
     ).line_integrals
 
 

@@ -336,7 +336,7 @@ def weighted_scan(scan: Any, weights: Any, scanner: Scanner | None = None) -> An
         scan,
         counts=first,
         air=air,
-        surround=None if scan.surround is None else _summed_cells(scan.surround, values),
+        exterior=None if scan.exterior is None else _summed_cells(scan.exterior, values),
         linearisation=_linearisation(scanner, values),
         counting=False,
         quantum=quantum,

@@ -71,7 +71,7 @@ def anatomy_rows(
 
     Args:
         name: of the anatomy.
-        clean: noise-free scan of the inset ``grid``, whose surround is the patient.
+        clean: noise-free scan of the inset ``grid``, whose exterior is the patient.
         draws: of the noise, from ``seed`` on.
         methods: of :data:`METHODS`.
         reconstruct: by ``"soft"`` (FBP) or a method.

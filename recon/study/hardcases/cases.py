@@ -251,8 +251,8 @@ def _cell_gains(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
 def _rolled(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
     """The detector turned by 2° about its normal: a row at the height h reads what lies h tan 2°
     beside it."""
-    assert clean.surround is not None
-    still, g = clean._at_window(clean.surround), clean.geometry
+    assert clean.exterior is not None
+    still, g = clean._at_window(clean.exterior), clean.geometry
     shifts = math.tan(math.radians(2.0)) * g.row_positions / g.pitch[1]
     ratio = (clean.counts / still).numpy()
     moved = [
@@ -270,10 +270,10 @@ def _bowtie(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
 
 
 def _moving(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
-    """Everything but its surround swings along x by six columns (1.2 mm) to either side, once in
+    """Everything but its exterior swings along x by six columns (1.2 mm) to either side, once in
     a turn."""
-    assert scan.surround is not None
-    still = scan._at_window(scan.surround)
+    assert scan.exterior is not None
+    still = scan._at_window(scan.exterior)
     turn = scan.geometry.angles
     shifts = np.round(-6 * np.cos(turn + 0.7) * np.sin(turn)).astype(int).tolist()
     moved = torch.stack(

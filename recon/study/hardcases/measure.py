@@ -329,8 +329,8 @@ def _case(
         if grid.ndim == 2:
             grid = VolumeGrid((1, *grid.shape), (1.0, *grid.spacing), (0.0, *grid.center))
         seen = torch.from_numpy(untouched(scene, base.scene, grid)).reshape(base.grid.shape)
-        if base.clean.surround is not None and clean.surround is not None:
-            lost *= float(base.clean._at_window(base.clean.surround / clean.surround).mean()) ** 0.5
+        if base.clean.exterior is not None and clean.exterior is not None:
+            lost *= float(base.clean._at_window(base.clean.exterior / clean.exterior).mean()) ** 0.5
     try:
         scan: Scan | Exception = case.apply(clean, noisy, np.random.default_rng(settings.seed))
     except (ValueError, TypeError) as error:

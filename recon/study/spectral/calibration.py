@@ -18,8 +18,8 @@ from torchpcct.scanner import Scanner, SiliconDetector, TransportedSilicon
 from torchpcct.spectral import (
     MMD_TISSUES,
     SpectralModel,
+    decompose_exterior,
     decompose_scan,
-    decompose_surround,
     vmi,
 )
 
@@ -113,15 +113,15 @@ def decomposed(
     factor = air / scan.clean.air if error.air_scan else torch.ones_like(air)
     factor[slice(None) if error.bin is None else error.bin] *= 1.0 + error.gain
     true = scan.clean
-    assert true.surround is not None
+    assert true.exterior is not None
     counts = true.counts * scan.window.take(factor).to(true.counts)
     # The model's own counts in air, so that it takes the scan for its own.
     believed = replace(
-        true, counts=counts, surround=true.surround * factor.to(true.surround), air=air
+        true, counts=counts, exterior=true.exterior * factor.to(true.exterior), air=air
     )
     found = decompose_scan(believed, model, tolerance=1e-3)
     fbp = InsetFbp(
-        true, [scan.grid], [scan.settings.kernel], surround=decompose_surround(believed, model)
+        true, [scan.grid], [scan.settings.kernel], exterior=decompose_exterior(believed, model)
     )
     return fbp.images(found.line_integrals)[0][0], float((~found.converged).double().mean())
 

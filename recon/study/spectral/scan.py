@@ -30,8 +30,8 @@ from torchpcct.spectral import (
     Decomposition,
     SpectralModel,
     clean,
+    decompose_exterior,
     decompose_scan,
-    decompose_surround,
     label,
     mmd,
     nearest,
@@ -133,14 +133,14 @@ class SpectralScan:
         return self._pieces("exact", run)
 
     @cached_property
-    def surround(self) -> Tensor:
+    def exterior(self) -> Tensor:
         """``(2, rows, columns)`` line integrals in mm outside the window."""
-        return decompose_surround(self.clean, self.model(NOISE_FREE_EXPOSURE_S))
+        return decompose_exterior(self.clean, self.model(NOISE_FREE_EXPOSURE_S))
 
     @cached_property
     def fbp(self) -> InsetFbp:
         """FBP of the two basis images."""
-        return InsetFbp(self.clean, [self.grid], [self.settings.kernel], surround=self.surround)
+        return InsetFbp(self.clean, [self.grid], [self.settings.kernel], exterior=self.exterior)
 
     @cached_property
     def fat(self) -> Tensor:
@@ -240,7 +240,7 @@ class Tissues:
         # As the detector sees the tissues behind the patient: iodine's K edge makes blood depend on
         # the spectrum.
         centre = model.columns // 2
-        path = scan.surround[:, scan.surround.shape[1] // 2, centre].double().numpy()
+        path = scan.exterior[:, scan.exterior.shape[1] // 2, centre].double().numpy()
         detected = model.spectra[centre].sum(0) * np.exp(-path @ model.attenuation)
         corners = [self.basis.coefficients(t, model.energies, detected) for t in MMD_TISSUES]
         self.corners = np.stack(corners, axis=1)

@@ -14,7 +14,7 @@ from torchpcct import VolumeGrid
 
 @pytest.fixture(scope="module")
 def run(spectral):
-    return InsetFbp(spectral[0], [GRID], ["standard"], surround=spectral[3])
+    return InsetFbp(spectral[0], [GRID], ["standard"], exterior=spectral[3])
 
 
 def test_channels_are_the_fbp_of_the_whole_rows(spectral, run):
@@ -31,7 +31,7 @@ def test_channels_are_the_fbp_of_the_whole_rows(spectral, run):
 
 def test_channels_take_batches_kernels_and_motion(spectral, run):
     clean, _, inside, around = spectral
-    several = InsetFbp(clean, [GRID], ["soft", "standard"], surround=around)
+    several = InsetFbp(clean, [GRID], ["soft", "standard"], exterior=around)
     (found,) = several.images(torch.stack([inside, 2 * inside]))
     assert found.shape == (2, 2, 2, *GRID.shape)
     torch.testing.assert_close(found[1, 0], run.images(inside)[0][0])
@@ -39,7 +39,7 @@ def test_channels_take_batches_kernels_and_motion(spectral, run):
         clean,
         [GRID],
         ["soft", "standard"],
-        surround=around,
+        exterior=around,
         motion=np.zeros((clean.geometry.views, 3)),
     )
     torch.testing.assert_close(
@@ -54,11 +54,11 @@ def test_refusals(spectral, run):
     refused(
         ("channels", lambda: run.images(inside[:1])),
         (
-            "surround must have the shape",
-            lambda: InsetFbp(clean, [GRID], ["standard"], surround=around[..., :9]),
+            "exterior must have the shape",
+            lambda: InsetFbp(clean, [GRID], ["standard"], exterior=around[..., :9]),
         ),
         ("decompose the energy bins, or sum", lambda: InsetFbp(clean, [GRID], ["standard"])),
-        ("beyond the region", lambda: InsetFbp(clean, [beside], ["standard"], surround=around)),
+        ("beyond the region", lambda: InsetFbp(clean, [beside], ["standard"], exterior=around)),
         (
             "ray_covariance",
             lambda: functional_covariance(run, torch.zeros(2, *GRID.shape), torch.zeros(2, 3)),

@@ -111,7 +111,7 @@ def test_a_moving_body_is_shown_at_rest(name):
     assert float((ignored - rest).abs().max() / rest.max()) > 0.3
 
 
-# A vessel in a cylinder of fat: the surround stands still.
+# A vessel in a cylinder of fat: the exterior stands still.
 
 CENTER = (0.0, -24.0, -20.0)
 GRID = VolumeGrid((4, 24, 24), 0.4, CENTER)
@@ -202,7 +202,7 @@ def test_refusals(scans, path):
     whole = replace(
         scans[0.0],
         window=None,
-        surround=None,
+        exterior=None,
         region=None,
         counts=torch.ones(scans[0.0].geometry.shape),
     )
@@ -221,7 +221,7 @@ def test_refusals(scans, path):
             lambda: backproject(data[:, :30], geometry, grid, narrow, motion=np.full((12, 2), 4.0)),
         ),
         ("rotation_s", lambda: view_motion(SinusoidalMotion("vessel", 1.0), geometry, 0.0)),
-        ("surround at rest", lambda: InsetFbp(whole, [GRID], ["soft"], motion=path)),
+        ("exterior at rest", lambda: InsetFbp(whole, [GRID], ["soft"], motion=path)),
     )
 
 

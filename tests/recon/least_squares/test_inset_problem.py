@@ -99,7 +99,7 @@ def test_refusals(clean):
     with pytest.raises(ValueError, match="one exposure"):
         reconstruct([clean.with_noise(t, 0) for t in (1.0, 2.0)], GRID, "pwls", batch=2)
     spectral = replace(
-        whole, counts=clean.counts[None], air=clean.air[None], surround=clean.surround[None]
+        whole, counts=clean.counts[None], air=clean.air[None], exterior=clean.exterior[None]
     )
     refused(
         ("energy of its quanta", lambda: InsetProblem(replace(clean, counting=False), GRID)),

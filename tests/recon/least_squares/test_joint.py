@@ -224,7 +224,7 @@ def test_basis_images_of_a_ball(spectral):
     images, report = basis.solve(lines, clean.window, QGGMRF(1e-3, 300.0), dose=2.0, tolerance=0.2)
     assert report["converged"]
     assert images.shape == (2, *GRID.shape)
-    reference = InsetFbp(clean, [GRID], ["soft"], surround=around).images(lines)[0][0]
+    reference = InsetFbp(clean, [GRID], ["soft"], exterior=around).images(lines)[0][0]
     white, fbp_white = (basis.whitening.apply(v) for v in (images, reference))
     for place in ((slice(2, 4), slice(5, 7), slice(5, 7)), (slice(2, 4), slice(0, 2), slice(0, 2))):
         middle = (slice(None), *place)

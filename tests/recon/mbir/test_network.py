@@ -121,7 +121,7 @@ def with_config(network, **options):
 
 
 def test_relative_to_the_local_mean_a_constant_passes_through(network):
-    """Relative to the surround it does not: what is unsure is drawn to 0."""
+    """Relative to the level it does not: what is unsure is drawn to 0."""
     u, towards = volumes()
     local = with_config(network, local_mm=1.6)
     found = local(u, towards, CONDITION)

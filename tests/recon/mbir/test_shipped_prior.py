@@ -34,14 +34,14 @@ from recon.mbir.unrolled import (
 
 FAT = drawn_vessel.VALUES["fat"]
 LEVEL = 1.0 + FAT / 1000.0
-"""Of the surround, in units of water: fat."""
+"""Of what lies about the vessel, in units of water: fat."""
 RIM = 3
 """Voxels at the faces that are not compared."""
 
 
 @pytest.fixture(scope="module")
 def drawn():
-    """Operators, truth and readings of the vessel above the surround."""
+    """Operators, truth and readings of the vessel above the fat about it."""
     views, rows = 240, 20
     A, w = problem(views, (22, 30, 30), 0.2, rows)
     fine, _ = problem(views, (44, 60, 60), 0.1, rows)

@@ -82,7 +82,7 @@ def test_adjoint_vectors_of_the_grids_share_one_window(measured):
         scanned.clean,
         counts=torch.ones(scanned.clean.geometry.shape),
         window=None,
-        surround=None,
+        exterior=None,
         region=None,
     )
     with pytest.raises(ValueError, match="windowed"):

@@ -33,9 +33,9 @@ def test_deviations_are_those_of_fbp(clean):
 
 
 def test_a_scan_of_the_whole_detector_is_refused():
-    with pytest.raises(ValueError, match="surround is known"):
+    with pytest.raises(ValueError, match="exterior is known"):
         fbp_deviations(
-            SimpleNamespace(window=None, surround=None),
+            SimpleNamespace(window=None, exterior=None),
             GRID,
             {"fat": np.ones(GRID.shape, np.float32)},
         )

@@ -100,7 +100,7 @@ def compared(scene, scan, seen, cells, rays, seed):
     """Errors of ``cells`` readings whose inset adds more than a share ``seen`` of its peak;
     peaks of all and of it."""
     polychromatic = (scan._at_window(scan.air.log()) - scan.counts.log()).numpy()
-    inset = polychromatic - scan._at_window(scan.air.log() - scan.surround.log()).numpy()
+    inset = polychromatic - scan._at_window(scan.air.log() - scan.exterior.log()).numpy()
     rng = np.random.default_rng(seed)
     chosen = np.argwhere(inset > seen * inset.max())
     chosen = chosen[rng.choice(len(chosen), cells, replace=False)]
@@ -263,7 +263,7 @@ def test_a_scene_without_symmetric_bodies():
     ball = Ellipsoid(4.0, position=(30.0, 0.0, 0.0))
     region = VolumeGrid((24, 24, 24), 0.5, (0.0, 0.0, 30.0))
     scan = acquire(Scene([Body("ball", ball, "water")]), scanner(8, 2), region=region, sub_rays=16)
-    torch.testing.assert_close(scan.surround, scan.air, rtol=1e-6, atol=0)
+    torch.testing.assert_close(scan.exterior, scan.air, rtol=1e-6, atol=0)
     p = scan.line_integrals()
     assert p.max() == pytest.approx(8.0 * scan.linearisation.mu_ref, rel=0.02)
     assert p.amin(dim=-1).abs().max() < 1e-6

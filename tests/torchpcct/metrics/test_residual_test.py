@@ -120,7 +120,7 @@ def test_a_wrong_noise_level_is_found():
 
 
 def test_what_voxels_leave_at_edges_is_no_error_of_the_scan():
-    """Sound scans were told that "exposure, geometry or surround are not those of the scan"."""
+    """Sound scans were told that "exposure, geometry or exterior are not those of the scan"."""
     step = torch.zeros(SHAPE, dtype=torch.float64)
     step[..., 8:16] = 0.1
     edge = torch.zeros(SHAPE, dtype=torch.float64)

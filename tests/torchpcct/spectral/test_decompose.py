@@ -13,8 +13,8 @@ from torchpcct.spectral import (
     SpectralModel,
     cramer_rao,
     decompose,
+    decompose_exterior,
     decompose_scan,
-    decompose_surround,
     inverse,
 )
 
@@ -228,7 +228,7 @@ def test_windowed_scan():
     some = torch.rand(scan.counts.shape[1:], generator=torch.Generator().manual_seed(0)) < 0.1
     chosen = decompose_scan(scan, model, readings=some).line_integrals
     assert torch.equal(chosen, found.line_integrals[:, some])
-    around = decompose_surround(scan, model)
+    around = decompose_exterior(scan, model)
     assert around.shape == (2, 2, 400)
     assert float(around[0, 0, 200]) == pytest.approx(40, abs=0.05)
     with pytest.raises(ValueError, match="air counts of scan and model differ"):

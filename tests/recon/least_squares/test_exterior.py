@@ -1,4 +1,4 @@
-"""An unknown surround, found by a coarse FBP of the whole field."""
+"""An unknown exterior, found by a coarse FBP of the whole field."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.least_squares.surround import UnknownSurround, _joined_views
+from recon.least_squares.exterior import UnknownExterior, _joined_views
 from torchpcct import ConeBeam, Projector, VolumeGrid, full_turn
 from torchpcct.detector_window import footprint
 
@@ -27,7 +27,7 @@ def lines():
 @pytest.fixture(scope="module")
 def around():
     window = footprint(GEOMETRY, GRID, margin=1)
-    return UnknownSurround(GEOMETRY, GRID, window, Projector(GEOMETRY, GRID, window))
+    return UnknownExterior(GEOMETRY, GRID, window, Projector(GEOMETRY, GRID, window))
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def test_nothing_is_left_of_a_uniform_inset(around, lines, left):
 
 
 def test_what_the_inset_holds_stays_its_own(around, lines, left):
-    """A ball in it: its readings are left, and nothing of it is taken for surround (once 12 %
+    """A ball in it: its readings are left, and nothing of it is taken for exterior (once 12 %
     were)."""
     z, y, x = np.meshgrid(*GRID.axes, indexing="ij")
     ball = torch.from_numpy(0.02 * (np.hypot(np.hypot(y - 12.0, x + 15.0), z) < 1.8)).float()
@@ -58,7 +58,7 @@ def test_a_body_beyond_the_detector_is_refused(lines):
     """Its readings would be left in the inset's: 250 HU of a thorax."""
     narrow = ConeBeam(full_turn(360), 300.0, 550.0, 120, 8, (1.0, 0.9), detector="curved")
     window = footprint(narrow, GRID, margin=1)
-    around = UnknownSurround(narrow, GRID, window, Projector(narrow, GRID, window))
+    around = UnknownExterior(narrow, GRID, window, Projector(narrow, GRID, window))
     with pytest.raises(ValueError, match=r"rows end inside the object.*outside="):
         around.level(lines[..., 90:-90].contiguous())
 

@@ -11,7 +11,7 @@ known; Ziegler, Nielsen, Grass 2008, Med. Phys. 35:1317). Coarse voxels carry th
 the noise of the whole field, and they alone: high ones stay with their readings, as the weights of
 PWLS assume. A second FBP, on larger voxels still, adds what the first does not explain. Along z the
 readings are extended by the outermost rows. It takes views enough for its voxels, about 1500 for a
-thorax: with 246 the details of the inset leak into its own surround (10 HU at the edge of a lumen).
+thorax: with 246 the details of the inset leak into its own exterior (10 HU at the edge of a lumen).
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def length_unit(geometry: ConeBeam) -> float:
     return geometry.pitch[1] / geometry.magnification / CELL_MM
 
 
-class UnknownSurround:
+class UnknownExterior:
     """Takes off what the inset does not hold.
 
     Args:
