@@ -21,10 +21,11 @@ import math
 import os
 import platform
 import statistics
-import sys
+import tempfile
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from importlib import metadata, util
 from pathlib import Path
 from typing import Any
@@ -35,20 +36,21 @@ import torch
 from recon.analytic.backproject import BackprojectionPlan
 from recon.analytic.fbp import fbp
 from recon.api import reconstruct
-from recon.data_term import Quadratic
-from recon.gram.gram import Gram
-from recon.mbir.unrolled import Unrolled
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, Scan, VolumeGrid
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import full_turn
+from train.__main__ import build
+from train.config import LateConfig, load_config
+from train.processes import Group, gradient
+from train.run import Run
 
-LIMIT_S = 460.0
+LIMIT_S = 440.0
 """Seconds after which nothing new is begun."""
 SLOWEST_S = 20.0
 """First calls that take longer are not repeated."""
 ROUNDS = 5
 """Calls that a median is of."""
-TRAINING_S = 60.0
+TRAINING_S = 45.0
 GOALS_MS = {
     ("cone 256³, 360 × 384²", "forward"): 100,
     ("cone 256³, 360 × 384²", "adjoint"): 150,
@@ -377,44 +379,55 @@ def bandwidth(bench: Bench) -> dict[str, float]:
 
 
 def training(bench: Bench) -> dict[str, Any]:
-    """The network of MBIR, on data terms that are kept on the device: what a training does once its
-    scenes are painted."""
-    sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
-    from inset_operators import problem
+    """Steps of ``torchpcct train`` as it is packaged, on a few scenes: what a training does once
+    all views are on the device."""
+    root = Path(__file__).parents[2] / "train" / "configs"
+    config = load_config(root / ("quick.yaml" if bench.tiny else "default.yaml"))
+    kept = replace(config.data, scenes_kept=2 * config.batch, situations=config.data.situations[:1])
+    config = replace(config, data=kept, late=LateConfig(), steps=10**6)
+    with tempfile.TemporaryDirectory() as folder:
+        model, data, _, objective = build(config, Path(folder) / "views", str(bench.device))
+        begun = time.perf_counter()
+        data.prepare(max(1, len(os.sched_getaffinity(0)) - 2))
+        painted = time.perf_counter() - begun
+        run = Run(config, model, Group(), Path(folder) / "run")
+        run.begin(False, "")
+        volumes: list[int] = []
+        model.register_forward_pre_hook(lambda _, given: volumes.append(len(given[0].b)))
+        losses: list[float] = []
 
-    torch.manual_seed(0)
-    model = Unrolled().to(bench.device).train()
-    model.network.half_precision = bench.device.type == "cuda"
-    shape, views = ((8, 16, 16), 24) if bench.tiny else ((32, 64, 64), 240)
-    gram = Gram(*problem(views, shape, model.voxel_mm), 5)
-    tissue = torch.zeros((1 if bench.tiny else 8, *shape))
-    tissue[:, :, 4:-4, 4:-4] = 2e-3
-    b = gram.apply(tissue) + gram.noise((len(tissue),), generator=torch.Generator().manual_seed(0))
-    spacing = (model.voxel_mm,) * 3
-    term = Quadratic(gram, b, torch.ones(len(b), dtype=torch.float64), spacing, 0.02)
-    term = term.to(bench.device).in_noise_units()
-    goal = tissue.to(bench.device) / term.mm(torch.ones_like(term.b))
-    optimiser = torch.optim.Adam(model.parameters(), 1e-4)
-    limit = min(TRAINING_S, bench.left) if not bench.tiny else 0.0
-    steps, counted, begun, losses = 0, 2, time.perf_counter(), []
-    while steps < 2 or time.perf_counter() - begun < limit:
-        optimiser.zero_grad()
-        loss = (model(term) - goal).square().mean()
-        loss.backward()
-        optimiser.step()
-        losses.append(float(loss.detach()))
-        steps += 1
-        if steps == 2:  # without what is compiled and tuned at first
-            begun = time.perf_counter()
-    seconds = time.perf_counter() - begun
-    sound = all(map(math.isfinite, losses))
-    scenes = (steps - counted) * len(term.b) / seconds if steps > counted else 0.0
+        def step() -> None:
+            values, _ = gradient(config, model, data, objective, run.state.step, run.group)
+            run.step(values)
+            losses.append(values["loss"])
+
+        def seconds(work: Callable[[], Any], limit: float, least: int) -> tuple[float, int]:
+            """Of one call, mean over calls until the limit; and how many calls there were."""
+            calls, begun = 0, time.perf_counter()
+            while calls < least or time.perf_counter() - begun < limit:
+                work()
+                calls += 1
+            if bench.device.type == "cuda":
+                torch.cuda.synchronize()
+            return (time.perf_counter() - begun) / calls, calls
+
+        for _ in range(1 if bench.tiny else 5):  # what is compiled and tuned at first
+            step()
+        size = range(config.batch)
+        batch, _ = seconds(lambda: data.batch(run.state.step, config.batch, size), 0.0, 4)
+        volumes.clear()
+        whole, steps = seconds(step, 0.0 if bench.tiny else min(TRAINING_S, bench.left), 2)
     return {
-        "scenes_per_s": scenes,
+        "painted_s": painted,
+        "step_ms": 1e3 * whole,
+        "batch_ms": 1e3 * batch,
+        "scenes_per_s": config.batch / whole,
+        "volumes_per_s": sum(volumes) / steps / whole,
         "steps": steps,
+        "skipped": run.state.skipped,
         "first_loss": losses[0],
         "last_loss": losses[-1],
-        "agrees": sound,
+        "agrees": run.state.skipped == 0 and all(map(math.isfinite, losses)),
     }
 
 

@@ -48,6 +48,11 @@ CASES = {
         None,
     ),
     "cone": (ConeBeam([0.7], 60.0, 110.0, 4, 3, (1.7, 2.5), (0.6, -0.6)), _VOLUME, None),
+    "cone beside the source": (
+        ConeBeam(_TURN[:3], 3.0, 60.0, 9, 6, (9.0, 30.0)),
+        VolumeGrid((6, 4, 3), 1.0, (0.5, 6.0, 1.0)),
+        None,
+    ),
     # So far from the source that slabs share depth layers.
     "cone layered": (
         ConeBeam([2.4], 600.0, 1100.0, 4, 3, (1.7, 2.5), detector="curved"),

@@ -9,14 +9,14 @@ compute 64 times as slowly.
 
 **Forward.** Plane: lanes are neighbouring columns of one view, which walk the slabs of their own
 main axis, in an image that is turned for one of them so that neighbours read neighbours. Cone: one
-program per (view, column), lanes along the rows; a second depth layer is read only by cells that
-share layers.
+program per (view, column), lanes along the rows, four of them each: neighbours share an edge, which
+is read once; a second depth layer is read only by cells that share layers.
 
 **Adjoint.** Plane: lanes are the voxels of a slab. Cone: one program per voxel column, lanes along
-z. It walks the segments. All edges of a segment pass through the source, so their slope ``q`` tells
-them apart whatever the slab (of parallel rays, ``p``): a table of equal steps of it says with which
-column a voxel begins, with one look-up instead of a bisection. From there on the columns are
-followed until they are past the voxel.
+z, four slices each. It walks the segments. All edges of a segment pass through the source, so their
+slope ``q`` tells them apart whatever the slab (of parallel rays, ``p``): a table of equal steps of
+it says with which column a voxel begins, with one look-up instead of a bisection. From there on the
+columns are followed until they are past the voxel.
 
 A number that is no tensor is float32 to a compiled kernel: all that are not whole come in tensors
 of the data's dtype.
@@ -48,12 +48,63 @@ def _crossing(p0, q0, p1, q1, r, bits, ulp, number: tl.constexpr):
 
 
 @triton.jit
-def _read(base, zeta, last):
-    """Linear interpolation of knots 0…last at ``zeta``, clamped."""
-    zeta = tl.minimum(tl.maximum(zeta, 0.0), last)
-    k = tl.minimum(zeta.to(tl.int32), last - 1)
+def _knot(place, last):
+    """Of a place among knots 0…last, clamped: the knot below, and how far beyond it it lies."""
+    place = tl.minimum(tl.maximum(place, 0.0), last)
+    k = tl.minimum(place.to(tl.int32), last - 1)
+    return k, place - k
+
+
+@triton.jit
+def _read(base, k, part):
+    """Linear interpolation between a knot and the next."""
     low = tl.load(base + k)
-    return low + (zeta - k) * (tl.load(base + k + 1) - low)
+    return low + part * (tl.load(base + k + 1) - low)
+
+
+@triton.jit
+def _four(base, place, step, last):
+    """Of four cells side by side, the first of which begins at ``place``, the changes of what is
+    tabulated at knots 0…last. Neighbours share an edge, which is read once."""
+    k0, part0 = _knot(place, last)
+    k1, part1 = _knot(place + step, last)
+    k2, part2 = _knot(place + 2 * step, last)
+    k3, part3 = _knot(place + 3 * step, last)
+    k4, part4 = _knot(place + 4 * step, last)
+    e0, e1, e2 = _read(base, k0, part0), _read(base, k1, part1), _read(base, k2, part2)
+    e3, e4 = _read(base, k3, part3), _read(base, k4, part4)
+    return e1 - e0, e2 - e1, e3 - e2, e4 - e3
+
+
+@triton.jit
+def _four_rows(volume, first, stop, apart, knots, k0, part, wide, place, step, last):
+    """What four rows side by side see of the voxels first…stop of a slab, weighted by the width of
+    the overlap. Before the interpolation, which all voxels of a slab have in common, knots are
+    summed over the voxels: ``a`` those below the five edges of the rows, ``b`` those above."""
+    at0, part0 = _knot(place, last)
+    at1, part1 = _knot(place + step, last)
+    at2, part2 = _knot(place + 2 * step, last)
+    at3, part3 = _knot(place + 3 * step, last)
+    at4, part4 = _knot(place + 4 * step, last)
+    a0, a1, a2, a3, a4 = place * 0, place * 0, place * 0, place * 0, place * 0
+    b0, b1, b2, b3, b4 = a0, a0, a0, a0, a0
+    for k in tl.range(first, stop):
+        d = (k - k0).to(place.dtype)
+        w = tl.minimum(part + wide, d + 1.0) - tl.maximum(part, d)
+        base = volume + (k * apart).to(tl.int64) * knots
+        a0 += w * tl.load(base + at0)
+        b0 += w * tl.load(base + at0 + 1)
+        a1 += w * tl.load(base + at1)
+        b1 += w * tl.load(base + at1 + 1)
+        a2 += w * tl.load(base + at2)
+        b2 += w * tl.load(base + at2 + 1)
+        a3 += w * tl.load(base + at3)
+        b3 += w * tl.load(base + at3 + 1)
+        a4 += w * tl.load(base + at4)
+        b4 += w * tl.load(base + at4 + 1)
+    e0, e1, e2 = a0 + part0 * (b0 - a0), a1 + part1 * (b1 - a1), a2 + part2 * (b2 - a2)
+    e3, e4 = a3 + part3 * (b3 - a3), a4 + part4 * (b4 - a4)
+    return e1 - e0, e2 - e1, e3 - e2, e4 - e3
 
 
 @triton.jit
@@ -131,11 +182,11 @@ def project_cone(
     BLOCK: tl.constexpr,
 ):
     """``sums``: running sums along z, ``(batch, ny, nx, knots)``; ``heights``: ``(views, 5)``, see
-    ``passes``; ``out``: ``(batch, views, rows, columns)``."""
+    ``passes``; ``out``: ``(batch, views, rows, columns)``. A lane has four rows."""
     number: tl.constexpr = out.dtype.element_ty
     cell, batch = tl.program_id(0), tl.program_id(2).to(tl.int64)
     view, column = cell // columns, cell % columns
-    row = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
+    row = 4 * (tl.program_id(1) * BLOCK + tl.arange(0, BLOCK))
     beside = (row - middle).to(number)
     axis = tl.load(axes + cell)
     slabs, width = tl.where(axis == 0, ny, nx), tl.where(axis == 0, nx, ny)
@@ -147,36 +198,54 @@ def project_cone(
     source, climb = tl.load(heights + view * 5), tl.load(heights + view * 5 + 1)
     volume = sums + batch * ny * nx * knots
     p0, q0, p1, q1 = _edges(lines, cell)
-    acc = tl.zeros((BLOCK,), dtype=number)
+    acc0, acc1 = tl.zeros((BLOCK,), dtype=number), tl.zeros((BLOCK,), dtype=number)
+    acc2, acc3 = tl.zeros((BLOCK,), dtype=number), tl.zeros((BLOCK,), dtype=number)
     for r in tl.range(0, slabs):
         k0, part, wide = _crossing(p0, q0, p1, q1, r, bits, ulp, number)
         depth = l0 + l1 * r
         first = tl.maximum(k0, 0)
         stop = tl.minimum(k0 + tl.ceil(part + wide).to(tl.int32), width)
         stop = tl.where(depth > nearest, stop, first)
-        scale = path / wide
         whole = tl.floor(depth / layer)
         upper = depth / layer - whole
         at = tl.where(layered, whole * layer, depth)
         share = tl.where(layered, 1.0 - upper, 1.0)
+        slab = volume + (r * across).to(tl.int64) * knots
         step = at * pitch
-        zeta = source + at * climb + step * beside
-        for k in tl.range(first, stop):
-            d = (k - k0).to(number)
-            w = scale * (tl.minimum(part + wide, d + 1.0) - tl.maximum(part, d))
-            base = volume + (r * across + k * along).to(tl.int64) * knots
-            change = _read(base, zeta + step, last) - _read(base, zeta, last)
-            acc += (w * share / step) * change
-            if layered & (upper > 0):
-                far = at + layer
-                far_step = far * pitch
-                above = source + far * climb + far_step * beside
-                change = _read(base, above + far_step, last) - _read(base, above, last)
-                acc += (w * upper / far_step) * change
-    rise = tl.load(heights + view * 5 + 2) + tl.load(numbers + 5) * beside
-    acc = acc * tl.sqrt(1.0 + rise * rise / square)
+        place = source + at * climb + step * beside
+        d0, d1, d2, d3 = _four_rows(
+            slab, first, stop, along, knots, k0, part, wide, place, step, last
+        )
+        scale = tl.where(stop > first, path / wide * share / step, 0.0)  # the depth may be 0
+        acc0 += scale * d0
+        acc1 += scale * d1
+        acc2 += scale * d2
+        acc3 += scale * d3
+        if layered & (upper > 0):
+            step = (at + layer) * pitch
+            place = source + (at + layer) * climb + step * beside
+            d0, d1, d2, d3 = _four_rows(
+                slab, first, stop, along, knots, k0, part, wide, place, step, last
+            )
+            scale = tl.where(stop > first, path / wide * upper / step, 0.0)
+            acc0 += scale * d0
+            acc1 += scale * d1
+            acc2 += scale * d2
+            acc3 += scale * d3
+    rise, pitch = tl.load(heights + view * 5 + 2), tl.load(numbers + 5)
+    rise = rise + pitch * beside
     target = out + ((batch * views + view) * rows + row) * columns + column
-    tl.store(target, acc, mask=row < rows)
+    acc0 = acc0 * tl.sqrt(1.0 + rise * rise / square)
+    tl.store(target, acc0, mask=row < rows)
+    rise += pitch
+    acc1 = acc1 * tl.sqrt(1.0 + rise * rise / square)
+    tl.store(target + columns, acc1, mask=row + 1 < rows)
+    rise += pitch
+    acc2 = acc2 * tl.sqrt(1.0 + rise * rise / square)
+    tl.store(target + 2 * columns, acc2, mask=row + 2 < rows)
+    rise += pitch
+    acc3 = acc3 * tl.sqrt(1.0 + rise * rise / square)
+    tl.store(target + 3 * columns, acc3, mask=row + 3 < rows)
 
 
 @triton.jit
@@ -293,17 +362,21 @@ def backproject_cone(
 ):
     """Add a slice of views, ``begin`` and on, to ``out``, ``(batch, slabs, width, nz)``.
 
-    ``sums``: running sums along the rows, ``(batch, views, columns, rows + 1)``.
+    ``sums``: running sums along the rows, ``(batch, views, columns, rows + 1)``. A lane has four
+    slices.
     """
     number: tl.constexpr = out.dtype.element_ty
     r, k = tl.program_id(0) // width, tl.program_id(0) % width
-    z = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
+    z = 4 * (tl.program_id(1) * BLOCK + tl.arange(0, BLOCK))
     batch = tl.program_id(2).to(tl.int64)
     beside = (z - middle).to(number)
     ulp, nearest, layer = tl.load(numbers), tl.load(numbers + 1), tl.load(numbers + 2)
     limit, pitch = tl.load(numbers + 3), tl.load(numbers + 6)
     target = out + ((batch * slabs + r) * width + k) * nz + z
-    acc = tl.load(target, mask=z < nz, other=0.0)
+    acc0 = tl.load(target, mask=z < nz, other=0.0)
+    acc1 = tl.load(target + 1, mask=z + 1 < nz, other=0.0)
+    acc2 = tl.load(target + 2, mask=z + 2 < nz, other=0.0)
+    acc3 = tl.load(target + 3, mask=z + 3 < nz, other=0.0)
     for s in tl.range(0, count):
         of, table = segments + s * 6, tables + s * 6
         view, first, cells = tl.load(of), tl.load(of + 1), tl.load(of + 2)
@@ -330,13 +403,23 @@ def backproject_cone(
                 whole = tl.floor(depth / layer)
                 upper = depth / layer - whole
                 at = tl.where(layered, whole * layer, depth)
-                share = tl.where(layered, 1.0 - upper, 1.0)
+                share = w * tl.where(layered, 1.0 - upper, 1.0)
                 step = pitch / at
-                rho = source / at - foot + step * beside
-                acc += (w * share) * (_read(base, rho + step, rows) - _read(base, rho, rows))
+                place = source / at - foot + step * beside
+                d0, d1, d2, d3 = _four(base, place, step, rows)
+                acc0 += share * d0
+                acc1 += share * d1
+                acc2 += share * d2
+                acc3 += share * d3
                 if layered & (upper > 0):
-                    far = at + layer
-                    step = pitch / far
-                    rho = source / far - foot + step * beside
-                    acc += (w * upper) * (_read(base, rho + step, rows) - _read(base, rho, rows))
-    tl.store(target, acc, mask=z < nz)
+                    step = pitch / (at + layer)
+                    place = source / (at + layer) - foot + step * beside
+                    d0, d1, d2, d3 = _four(base, place, step, rows)
+                    acc0 += w * upper * d0
+                    acc1 += w * upper * d1
+                    acc2 += w * upper * d2
+                    acc3 += w * upper * d3
+    tl.store(target, acc0, mask=z < nz)
+    tl.store(target + 1, acc1, mask=z + 1 < nz)
+    tl.store(target + 2, acc2, mask=z + 2 < nz)
+    tl.store(target + 3, acc3, mask=z + 3 < nz)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from torchpcct.typing import Floats
 
 LANES = 128
-"""Columns or voxels of a program of a plane; of a cone beam twice as many rows or slices."""
+"""Columns or voxels of a program of a plane, rows of one of a cone beam, and half of its slices."""
 _STEPS = 2
 """Steps of a segment's look-up table for each of its columns."""
 
@@ -149,8 +149,9 @@ class GpuPasses:
             return
         sums = x.new_zeros((batch, ny, nx, nz + 1))
         torch.cumsum(x.permute(0, 2, 3, 1), dim=-1, out=sums[..., 1:])
-        block = min(2 * self.lanes, _power_of_two(rays.rows))
-        kernels.project_cone[(rays.views * rays.columns, math.ceil(rays.rows / block), batch)](
+        fours = math.ceil(rays.rows / 4)
+        block = min(max(1, self.lanes // 4), _power_of_two(fours))
+        kernels.project_cone[(rays.views * rays.columns, math.ceil(fours / block), batch)](
             sums,
             out,
             self.lines,
@@ -168,7 +169,7 @@ class GpuPasses:
             rays.columns,
             rays.rows // 2,
             BLOCK=block,
-            num_warps=_warps(block, 128),
+            num_warps=_warps(block, 32),
         )
 
     def adjoint(self, y: Tensor) -> Tensor:
@@ -228,8 +229,9 @@ class GpuPasses:
                         num_warps=_warps(block, 32),
                     )
                     continue
-                block = min(2 * self.lanes, _power_of_two(nz))
-                kernels.backproject_cone[(slabs * width, math.ceil(nz / block), batch)](
+                fours = math.ceil(nz / 4)
+                block = min(max(1, self.lanes // 2), _power_of_two(fours))
+                kernels.backproject_cone[(slabs * width, math.ceil(fours / block), batch)](
                     *given,
                     of.heights,
                     of.numbers,
@@ -244,7 +246,7 @@ class GpuPasses:
                     rays.columns,
                     nz // 2,
                     BLOCK=block,
-                    num_warps=_warps(block, 128),
+                    num_warps=_warps(block, 64),
                 )
         total = parts[0].add_(parts[1].transpose(1, 2))
         return total[..., 0] if self.plane else total.permute(0, 3, 1, 2)
