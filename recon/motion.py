@@ -57,6 +57,7 @@ from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import ConeBeam, VolumeGrid, project_points
 from torchpcct.projector import Projector, with_parameters
 from torchpcct.projector.posed import PosedEngine
+from torchpcct.readings import MEDIAN_TO_SD
 from torchpcct.scan import Scan
 from torchpcct.validate import checked, number
 from torchpcct.vector_geometry import check_motion
@@ -453,7 +454,7 @@ def _quiet(volume: Tensor) -> Tensor:
     """Smoothed, and what is no more than its noise shrunk to nothing (non-negative garrote; Breiman
     1995, Technometrics 37:373): effects of noise would be found again in the readings' noise."""
     soft = torch.from_numpy(gaussian_filter(volume.numpy(), _SMOOTH_VOXELS, mode="nearest"))
-    noise = soft.abs().median() / 0.6745
+    noise = MEDIAN_TO_SD * soft.abs().median()
     return soft * (1.0 - (_NOISES * noise / soft.abs().clamp_min(1e-12)).square()).clamp_min(0.0)
 
 

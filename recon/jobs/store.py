@@ -11,7 +11,7 @@ import json
 import logging
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -179,6 +179,8 @@ def was_kept(path: Path) -> bool:
 
 
 T = TypeVar("T")
+Step = tuple[Callable[..., object], Iterable[tuple[object, ...]]]
+"""A function of a module and the calls of it that are independent, for :meth:`Pieces.ahead`."""
 
 
 class Pieces:
@@ -217,16 +219,10 @@ class Pieces:
         self._asked.add(self._prefix + name)
         if self._store is None:
             return compute()
-        planning = isinstance(execute.current(), execute.Planner)
-        if planning and not self._store.has(self._prefix + name, self._key):
-            raise execute.Planned(
-                f"nothing was run: the study computes {self._prefix + name!r} in one process "
-                "first, and lists jobs, if it has any, once that is kept"
-            )
         found: T = self._store.piece(self._prefix + name, self._key, compute)
         return found
 
-    def ahead(self, function: Callable[..., object], *calls: tuple[object, ...]) -> None:
+    def ahead(self, function: Callable[..., object], calls: Iterable[tuple[object, ...]]) -> None:
         """Let other processes compute pieces of calls that are independent, before this one reads
         them one by one.
 
@@ -240,6 +236,29 @@ class Pieces:
         executor = execute.current()
         if self._store is None or executor is None:
             return
+        store, key = self._store, self._key
+        execute.run(
+            self._left(function, calls),
+            store.folder,
+            executor,
+            finished=lambda job: store.piece(self._done(job), key, dict),
+        )
+
+    def plan(self, *steps: Step) -> None:
+        """In a dry run list the jobs of all steps that are not done, of each what :meth:`ahead` is
+        given; nothing where none is left.
+
+        Raises:
+            recon.jobs.execute.Planned: with the list.
+        """
+        left = [job for function, calls in steps for job in self._left(function, calls)]
+        if left and isinstance(planner := execute.current(), execute.Planner):
+            execute.run(left, Path(), planner)
+
+    def _left(
+        self, function: Callable[..., object], calls: Iterable[tuple[object, ...]]
+    ) -> list[execute.Job]:
+        """Those of the jobs of :meth:`ahead` that are not done."""
         name = function.__name__.strip("_")
         jobs = [
             execute.Job(
@@ -251,18 +270,12 @@ class Pieces:
             )
             for call in calls
         ]
-        done = {
-            job.name: f"done/{hashlib.sha256((self._prefix + job.name).encode()).hexdigest()[:12]}"
-            for job in jobs
-        }
-        left = [job for job in jobs if not self._store.has(done[job.name], self._key)]
-        store, key = self._store, self._key
-        execute.run(
-            left,
-            store.folder,
-            executor,
-            finished=lambda job: store.piece(done[job.name], key, dict),
-        )
+        store = self._store
+        return [j for j in jobs if store is None or not store.has(self._done(j), self._key)]
+
+    def _done(self, job: execute.Job) -> str:
+        """The piece that says that a job is done."""
+        return f"done/{hashlib.sha256((self._prefix + job.name).encode()).hexdigest()[:12]}"
 
     def within(self, prefix: str) -> Pieces:
         """The same, with names that begin with ``prefix/``."""

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from recon.analytic.fbp import fbp
 from recon.evaluate.experiment import evaluate
 from recon.evaluate.tasks import read_task
-from recon.jobs.store import Pieces
+from recon.jobs.store import Pieces, Step
 from recon.study.paper import facts as paper
 from recon.study.report import Check, around
 from recon.study.study import Measured, Progress, StudySettings, silent
@@ -46,6 +46,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike
 
+    from recon.evaluate.experiment import Evaluation
+    from recon.evaluate.task import Task
     from torchpcct.typing import Bools, JsonObject
 
 
@@ -175,13 +177,7 @@ def measure(
 
     scanners = wide_scanners(8)
     data["transmission"] = transmission(scanners)
-    pieces.ahead(
-        _kept,
-        *(
-            (name,)
-            for name in ("ctdi", "patient", *(f"{k}_{n}" for k in ("noise", "map") for n in scenes))
-        ),
-    )
+    pieces.ahead(*_step())
     doses: dict[str, dict[str, CtdiDose]] = _kept(s, pieces, "ctdi")
     progress("dose", 0.3)
     data["ctdi_ratios"] = {k: ratios(v) for k, v in doses.items()}
@@ -215,6 +211,19 @@ def measure(
     data["combined"] = _combined(s, saved, pieces.folder("evaluate"), progress)
     images = {name: image for name, (_, image) in found.items()}
     return Measured(s, data, (maps, images))
+
+
+def plan(settings: BowtieSettings, folder: str | Path | None) -> None:
+    """List the jobs that are left: doses and noise, then those of the evaluation; see
+    :mod:`recon.study.study`."""
+    pieces = Pieces(folder, settings)
+    pieces.plan(_step())
+    _evaluated(settings, pieces.folder("evaluate"), silent)
+
+
+def _step() -> Step:
+    of_scenes = [f"{kind}_{name}" for kind in ("noise", "map") for name in phantoms()]
+    return _kept, [(name,) for name in ("ctdi", "patient", *of_scenes)]
 
 
 def _kept(settings: BowtieSettings, pieces: Pieces, name: str) -> Any:
@@ -517,21 +526,7 @@ def _combined(
         the dose that the bowtie saves (``product_…``); FBP's own ratio, with over without the ROI
         bowtie; MBIR's contrast slope.
     """
-    plain = read_task("plaque")
-    scanners = {b: presets.pcct(views=s.plaque_views, bowtie=b) for b in BOWTIES}
-    tasks = {
-        b: replace(plain, name=f"plaque-behind-{b.replace('+', '-')}", scanner=scanner)
-        for b, scanner in scanners.items()
-    }
-    found = evaluate(
-        list(tasks.values()),
-        ["fbp:soft", "mbir"],
-        exposures_s=s.plaque_doses,
-        n=s.plaque_realizations,
-        seed=s.seed,
-        folder=folder,
-        progress=progress,
-    )
+    tasks, found = _evaluated(s, folder, progress)
     large, roi = (tasks[b].name for b in BOWTIES)
 
     def record(task: str, method: str, dose: float, figure: str) -> Any:
@@ -573,6 +568,28 @@ def _combined(
             }
         results.append(row)
     return results
+
+
+def _evaluated(
+    s: BowtieSettings, folder: Path | None, progress: Progress
+) -> tuple[dict[str, Task], Evaluation]:
+    """FBP and MBIR of the plaque behind either bowtie: the tasks by bowtie, and what they gave."""
+    plaque = read_task("plaque")
+    scanners = {b: presets.pcct(views=s.plaque_views, bowtie=b) for b in BOWTIES}
+    tasks = {
+        b: replace(plaque, name=f"plaque-behind-{b.replace('+', '-')}", scanner=scanner)
+        for b, scanner in scanners.items()
+    }
+    found = evaluate(
+        list(tasks.values()),
+        ["fbp:soft", "mbir"],
+        exposures_s=s.plaque_doses,
+        n=s.plaque_realizations,
+        seed=s.seed,
+        folder=folder,
+        progress=progress,
+    )
+    return tasks, found
 
 
 # --- the report -----------------------------------------------------------------------------------

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
+    from recon.evaluate.task import Task
     from torchpcct.typing import JsonObject
 
 SCREEN = "compare_screen"
@@ -95,18 +96,9 @@ def measure(
 ) -> Measured:
     """Simulate, reconstruct, measure; see :mod:`recon.study.study`."""
     s = settings
-    task = replace(read_task("plaque"), scanner=presets.pcct(views=s.views))
+    task = _task(s)
     pieces = Pieces(folder, settings)
-    kept = pieces.folder("evaluate")
-    found = evaluate(
-        task,
-        s.methods,
-        exposures_s=s.exposures_s,
-        n=s.n,
-        seed=s.seed,
-        folder=kept,
-        progress=progress,
-    )
+    found = _evaluated(s, task, pieces.folder("evaluate"), progress)
     records = plain(found.records)
     data = {
         "claim": claim(records),
@@ -119,6 +111,30 @@ def measure(
         rows = partial(energy_rows, task, views=s.energies_views, progress=progress)
         data["energies"] = pieces("energies", rows)
     return Measured(s, data, found)
+
+
+def plan(settings: CompareSettings, folder: str | Path | None) -> None:
+    """List the jobs that are left; see :mod:`recon.study.study`."""
+    folder = Pieces(folder, settings).folder("evaluate")
+    _evaluated(settings, _task(settings), folder, silent)
+
+
+def _task(s: CompareSettings) -> Task:
+    return replace(read_task("plaque"), scanner=presets.pcct(views=s.views))
+
+
+def _evaluated(
+    s: CompareSettings, task: Task, folder: Path | None, progress: Progress
+) -> Evaluation:
+    return evaluate(
+        task,
+        s.methods,
+        exposures_s=s.exposures_s,
+        n=s.n,
+        seed=s.seed,
+        folder=folder,
+        progress=progress,
+    )
 
 
 def claim(records: list[JsonObject]) -> JsonObject | None:

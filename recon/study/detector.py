@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon.jobs.store import Pieces
+from recon.jobs.store import Pieces, Step
 from recon.study.report import Check
 from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.scanner import Scanner, SiliconDetector, presets
@@ -106,7 +106,7 @@ def measure(
             followed(f"energy_{i}", partial(at_energy, energy, max(1000, s.photons // 4), rng))
         )
         progress("photons followed, energies", (i + 1) / len(ENERGIES_KEV))
-    pieces.ahead(_pile_up, *((t,) for t in s.dead_times_ns))
+    pieces.ahead(*_pile_ups(s))
     data = {
         "counts": counts(),
         "efficiency": efficiency,
@@ -120,6 +120,15 @@ def measure(
     }
     progress("rates", 1.0)
     return Measured(s, data)
+
+
+def plan(settings: DetectorSettings, folder: str | Path | None) -> None:
+    """List the jobs that are left; see :mod:`recon.study.study`."""
+    Pieces(folder, settings).plan(_pile_ups(settings))
+
+
+def _pile_ups(s: DetectorSettings) -> Step:
+    return _pile_up, [(t,) for t in s.dead_times_ns]
 
 
 def _pile_up(settings: DetectorSettings, pieces: Pieces, dead_time_ns: float) -> dict[str, object]:

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from recon.analytic.inset import view_motion
-from recon.jobs.store import Pieces
+from recon.jobs.store import Pieces, Step
 from recon.least_squares.inset_problem import InsetProblem
 from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.mbir.mbir import Mbir
@@ -199,8 +199,7 @@ def measure(
     s, pieces, m = settings, Pieces(folder, settings), Found()
     scene, plaque = plaque_scene()
     reference = Reference.of(scene, plaque, inset_grid(plaque, s.voxel_mm))
-    fractions = {"PCCT": (0.0, *s.fractions), "EID-CT": (0.0, *s.eid_fractions)}
-    pieces.ahead(_scan, *((name, f) for name in SCANNERS for f in dict.fromkeys(fractions[name])))
+    pieces.ahead(*_step(s))
     data: JsonObject = {}
     for name in SCANNERS:
         still, moving = _residual(s, m, name, reference, pieces, progress)
@@ -236,6 +235,16 @@ def measure(
     }
     data["borne"] = _borne({**data, "settings": vars(s)})
     return Measured(s, data, m)
+
+
+def plan(settings: MotionSettings, folder: str | Path | None) -> None:
+    """List the jobs that are left; see :mod:`recon.study.study`."""
+    Pieces(folder, settings).plan(_step(settings))
+
+
+def _step(s: MotionSettings) -> Step:
+    fractions = {"PCCT": (0.0, *s.fractions), "EID-CT": (0.0, *s.eid_fractions)}
+    return _scan, [(name, f) for name in SCANNERS for f in dict.fromkeys(fractions[name])]
 
 
 def _residual(

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.api import reconstruct
-from recon.jobs.store import Pieces
+from recon.jobs.store import Pieces, Step
 from recon.motion import InsetMotion, estimate_motion
 from recon.study.figures import curve_axes
 from recon.study.motion_found import AlongAxis, Jump
@@ -198,10 +198,10 @@ def measure(
 ) -> Measured:
     """Simulate, estimate and compare, in resumable pieces; more vessels go on where fewer ended."""
     s, seen = settings, Seen()
-    pieces = Pieces(folder, replace(s, kinds=tuple(KINDS), vessels=1))
+    pieces = _pieces(s, folder)
     rows: list[JsonObject] = []
     vessels = range(s.first, s.first + s.vessels)
-    pieces.ahead(_path, *((kind, vessel) for kind in s.kinds for vessel in vessels))
+    pieces.ahead(*_step(s))
     for kind in s.kinds:
         for done, vessel in enumerate(vessels):
             truth, motions, found, seconds = _path(s, pieces, kind, vessel)
@@ -219,6 +219,20 @@ def measure(
         for exposure in s.exposures_s
     ]
     return Measured(s, {"paths": rows, "kinds": summary, "mbir_seconds": mbir}, seen)
+
+
+def plan(settings: PathsSettings, folder: str | Path | None) -> None:
+    """List the jobs that are left; see :mod:`recon.study.study`."""
+    _pieces(settings, folder).plan(_step(settings))
+
+
+def _pieces(s: PathsSettings, folder: str | Path | None) -> Pieces:
+    """Each vessel has its own, whatever others are asked for."""
+    return Pieces(folder, replace(s, kinds=tuple(KINDS), vessels=1))
+
+
+def _step(s: PathsSettings) -> Step:
+    return _path, [(k, vessel) for k in s.kinds for vessel in range(s.first, s.first + s.vessels)]
 
 
 def _path(

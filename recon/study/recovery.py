@@ -111,8 +111,8 @@ def measure(
     """
     s = settings
     pieces = Pieces(folder, s)
-    jobs = [(e, seed) for e in s.exposures_s for seed in range(s.seed, s.seed + s.n)]
-    pieces.ahead(_realisation, *jobs)
+    jobs = _pairs(s)
+    pieces.ahead(_realisation, jobs)
     clean = _clean(s, pieces)
     found: dict[tuple[float, int], list[dict[str, object]]] = {}
     for k, job in enumerate(jobs):
@@ -131,6 +131,16 @@ def measure(
         "weights_sha256": Mbir.load().weights_sha256,
     }
     return Measured(s, data)
+
+
+def plan(settings: RecoverySettings, folder: str | Path | None) -> None:
+    """List the jobs that are left; see :mod:`recon.study.study`."""
+    Pieces(folder, settings).plan((_realisation, _pairs(settings)))
+
+
+def _pairs(s: RecoverySettings) -> list[tuple[float, int]]:
+    """Exposure and seed of each realisation."""
+    return [(e, seed) for e in s.exposures_s for seed in range(s.seed, s.seed + s.n)]
 
 
 def shown_by_mbir(report: JsonObject) -> str:

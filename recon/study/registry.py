@@ -150,7 +150,9 @@ def measured(
     Raises:
         ValueError: an unknown study; what the study itself refuses.
         TypeError: settings of another study.
+        recon.jobs.execute.Planned: a dry run: the jobs that are left. Nothing is computed.
     """
+    from recon.jobs import execute
     from recon.study.study import Timed, silent  # loads torch
 
     study, kind = part(name), settings_class(name)
@@ -159,6 +161,12 @@ def measured(
             f"settings must be {kind.__module__}.{kind.__name__}, got {type(settings).__name__}"
         )
     timed = Timed(progress or silent)
+    if isinstance(execute.current(), execute.Planner):
+        if hasattr(study, "plan"):
+            study.plan(settings, pieces)
+        raise execute.Planned(
+            f"nothing was run: what is left of the study {name} is no jobs, one process computes it"
+        )
     found: Measured = study.measure(settings, timed, pieces)
     found.seconds = timed.seconds
     return found

@@ -91,7 +91,7 @@ _LIKE_THE_CHANGE = (0.6, 1.6)
 _CLEAR = 0.5
 """Squared change over its noise below which nothing is said. Edges leave up to 0.23 in sound
 scans."""
-_STEPS_A_RESIDUAL = 0.6745 * math.sqrt(7.0)
+_STEPS_A_RESIDUAL = math.sqrt(7.0) / MEDIAN_TO_SD
 """Median size of the residual of angles that scatter independently by one step (normal, rms)."""
 _REACH = 4
 """Views on either side that foretell a change, and one more."""

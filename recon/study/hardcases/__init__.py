@@ -3,3 +3,4 @@
 from recon.study.hardcases.measure import HardcasesSettings as HardcasesSettings
 from recon.study.hardcases.measure import figures as figures
 from recon.study.hardcases.measure import measure as measure
+from recon.study.hardcases.measure import plan as plan

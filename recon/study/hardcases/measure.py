@@ -22,7 +22,7 @@ import torch
 from recon import reconstruct
 from recon.evaluate.anatomies import ANATOMIES
 from recon.jobs.execute import captured_warnings
-from recon.jobs.store import Pieces
+from recon.jobs.store import Pieces, Step
 from recon.study.hardcases.anatomies import METHODS as ANATOMY_METHODS
 from recon.study.hardcases.anatomies import anatomy_rows
 from recon.study.hardcases.cases import (
@@ -174,28 +174,21 @@ def measure(
     :func:`recon.study.hardcases.anatomies.anatomy_rows`.
     """
     pieces = Pieces(folder, settings)
-    used = {CASES[name].base for name in settings.cases}
-    if settings.anatomies:
-        used.add("plaque")
     bases = {
-        name: make(settings, pieces.within(name), progress)
-        for name, make in _BASES.items()
-        if name in used
+        name: _BASES[name](settings, pieces.within(name), progress) for name in _used(settings)
     }
-    sound = [
-        (base, method) for base in bases for method in settings.methods if method in _METHODS[base]
-    ]
-    pieces.ahead(_sound, *sound)
-    for k, (name, method) in enumerate(sound):
+    sound, cases, anatomies = _steps(settings)
+    pieces.ahead(*sound)
+    for k, (name, method) in enumerate(_pairs(settings)):
         bases[name].sound(method)
         progress("sound scans", (k + 1) / len(sound))
-    pieces.ahead(_case, *((name,) for name in settings.cases))
+    pieces.ahead(*cases)
     rows = []
     for k, name in enumerate(settings.cases):
         rows += _case(settings, pieces, name, bases[CASES[name].base])
         progress("cases", (k + 1) / len(settings.cases))
     diseased = []
-    pieces.ahead(_anatomy, *((name,) for name in settings.anatomies))
+    pieces.ahead(*anatomies)
     for k, name in enumerate(settings.anatomies):
         diseased += _anatomy(settings, pieces, name, bases["plaque"])
         progress("anatomies", (k + 1) / len(settings.anatomies))
@@ -208,6 +201,31 @@ def measure(
         "silent": counts["SILENT"],
     }
     return Measured(settings, data)
+
+
+def plan(settings: HardcasesSettings, folder: str | Path | None) -> None:
+    """List the jobs that are left; see :mod:`recon.study.study`."""
+    Pieces(folder, settings).plan(*_steps(settings))
+
+
+def _steps(settings: HardcasesSettings) -> tuple[Step, Step, Step]:
+    """Sound scans, what is done to them, other anatomies: each step needs the one before it."""
+    return (
+        (_sound, _pairs(settings)),
+        (_case, [(name,) for name in settings.cases]),
+        (_anatomy, [(name,) for name in settings.anatomies]),
+    )
+
+
+def _used(settings: HardcasesSettings) -> list[str]:
+    """The bases of the cases and anatomies."""
+    used = {CASES[name].base for name in settings.cases}
+    return [name for name in _BASES if name in used or (settings.anatomies and name == "plaque")]
+
+
+def _pairs(settings: HardcasesSettings) -> list[tuple[str, str]]:
+    """Base and method of each volume of a sound scan."""
+    return [(b, m) for b in _used(settings) for m in settings.methods if m in _METHODS[b]]
 
 
 @dataclass(frozen=True)

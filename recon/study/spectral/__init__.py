@@ -5,3 +5,4 @@ from recon.study.spectral.measure import SpectralSettings as SpectralSettings
 from recon.study.spectral.measure import checks as checks
 from recon.study.spectral.measure import figures as figures
 from recon.study.spectral.measure import measure as measure
+from recon.study.spectral.measure import plan as plan

@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from recon.analytic.exact_noise import functional_covariance
-from recon.jobs.store import Pieces
+from recon.jobs.store import Pieces, Step
 from recon.least_squares.basis_problem import BasisProblem
 from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.study.figures import extent
@@ -173,7 +173,7 @@ def measure(
     progress("simulate", 1.0)
     noise_free = scan.fbp.images(scan.exact.line_integrals)[0][0]
     lines, volumes, data["rays"] = [], [], []
-    pieces.ahead(_noisy, *((k,) for k in range(s.realizations)))
+    pieces.ahead(*_step(s))
     for k in range(s.realizations):
         volume, used, statistics = _noisy(s, pieces, k, scan)
         data["rays"].append(statistics)
@@ -209,6 +209,15 @@ def measure(
     }
     data |= {"basis_residual_hu": residual, "processor_seconds": time.process_time() - spent}
     return Measured(s, data, Seen(scan, tissues, images))
+
+
+def plan(settings: SpectralSettings, folder: str | Path | None) -> None:
+    """List the jobs that are left; see :mod:`recon.study.study`."""
+    Pieces(folder, settings).plan(_step(settings))
+
+
+def _step(s: SpectralSettings) -> Step:
+    return _noisy, [(k,) for k in range(s.realizations)]
 
 
 def _noisy(

@@ -44,6 +44,7 @@ from recon.evaluate.tasks import read_task
 from recon.jobs import execute
 from recon.jobs.execute import Cluster, Job, LeftOut, Processes, run
 from recon.jobs.sources import _content, _follow, source_digest
+from recon.jobs.store import Pieces
 from recon.slabs import reconstruct_to
 from recon.study import registry
 from recon.study.results import differences
@@ -807,11 +808,39 @@ def test_a_dry_run_lists_the_jobs(here, cli):
     assert not list((here / "x").rglob("*.npz"))
 
 
-@pytest.mark.parametrize("name", ["noise", "paths"])
-def test_a_dry_run_of_a_study_computes_nothing(here, cli, name):
+LISTED = {
+    "compare": "plaque: scan, signal present",
+    "detector": "pile_up 20.0",
+    "bowtie": "kept noise_thorax",
+    "motion": "scan EID-CT 0.0",
+    "paths": "50 jobs",
+    "hardcases": "anatomy ",
+    "recovery": "realisation 2.0 1",
+    "spectral": "noisy 0",
+}
+"""A job of each study that has any."""
+
+
+@pytest.mark.parametrize("name", registry.STUDIES)
+def test_a_dry_run_of_a_study_computes_nothing(here, cli, name, monkeypatch):
+    def measure(*_):
+        raise AssertionError
+
+    monkeypatch.setattr(registry.part(name), "measure", measure)
     text = cli(f"study {name} --dry-run --out x")
-    assert "50 jobs" in text if name == "paths" else "nothing was run" in text
-    assert not list(here.rglob("*.npz"))
+    assert LISTED.get(name, "nothing was run") in text
+    assert not [path for path in here.rglob("*") if path.is_file()]
+
+
+def test_a_dry_run_leaves_out_what_is_done(here, cli):
+    settings = registry.build_settings("detector")
+    pieces = Pieces(here / "x", settings)
+    function, calls = registry.part("detector")._pile_ups(settings)
+    for job in pieces._left(function, calls[:2]):
+        pieces._store.piece(pieces._done(job), pieces._key, dict)
+    text = cli("study detector --dry-run --out x")
+    assert "1 jobs" in text
+    assert "pile_up 100.0" in text
 
 
 CALLED = """
