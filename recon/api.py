@@ -237,8 +237,8 @@ def reconstruct(
     began = time.perf_counter()
     moves: dict[str, Any] = {}
     if motion is not None:
-        said, moves = _moving(motion, name, scans[0], grid, chosen)
-        whole = [(s, [*texts, *said]) for s, texts in whole]
+        warned, moves = _moving(motion, name, scans[0], grid, chosen)
+        whole = [(s, [*texts, *warned]) for s, texts in whole]
     path = chosen.get("motion", getattr(chosen.get("problem"), "motion", None))
     found_of = methods[name](scans, grid, progress or (lambda _: None), **chosen)
     for batch in _within_memory(found_of, there):
@@ -266,7 +266,7 @@ def reconstruct(
 def _moving(
     motion: object, method: str, scan: Scan, grid: VolumeGrid, chosen: dict[str, Any]
 ) -> tuple[list[str], dict[str, Any]]:
-    """Put the inset's path into the options of a method; what is to be said of it, and reported."""
+    """Put the inset's path into the options of a method; its warnings, and its report."""
     from recon.motion import path_of
 
     if chosen.get("problem") is not None:
@@ -279,12 +279,12 @@ def _moving(
             "region="
         )
     path, found = path_of(motion, _here(scan), grid)
-    said, report = ([], {}) if found is None else (found.warnings, {"motion": found.report()})
+    warned, report = ([], {}) if found is None else (found.warnings, {"motion": found.report()})
     if found is not None and not found.held:
-        return said, report
+        return warned, report
     if method == "fbp":
         chosen["motion"] = path
-        return said, report
+        return warned, report
     from recon.least_squares.inset_problem import InsetProblem
 
     if method == "mbir":
@@ -293,7 +293,7 @@ def _moving(
         chosen["network"] = chosen.get("network") or Mbir.load()
         grid = working_grid(grid, chosen["network"].voxel_mm)
     chosen["problem"] = InsetProblem(scan, grid).with_motion(path)
-    return said, report
+    return warned, report
 
 
 def _device(scans: Sequence[Scan], device: str | int | torch.device | None) -> torch.device:

@@ -171,14 +171,14 @@ def nlm(
     strength: float = 0.6,
     patch: int = 1,
     search: int = 4,
-    told: float = 1.0,
+    noise_factor: float = 1.0,
 ) -> Image:
     """Non-local means in 3-D: a mean over voxels whose neighbourhoods are alike (Buades, Coll,
     Morel 2005, CVPR).
 
-    Weights are exp(−max(D² − 2 told² noise², 0) / (strength · noise)²), D² the mean squared
-    difference of two cubes. (scikit-image's fast mode compares cubes that are not centred: there a
-    mirrored volume gives another result.)
+    Weights are exp(−max(D² − 2 (noise_factor · noise_hu)², 0) / (strength · noise_hu)²), D² the
+    mean squared difference of two cubes. (scikit-image's fast mode compares cubes that are not
+    centred: there a mirrored volume gives another result.)
 
     Args:
         volume: ``(z, y, x)`` HU.
@@ -186,7 +186,8 @@ def nlm(
         strength: differences count from ``strength · noise_hu``.
         patch: the compared cubes reach so many voxels to each side.
         search: how far alike cubes are looked for, in voxels to each side.
-        told: share of ``noise_hu`` that is expected between like cubes and taken off; 0 for none.
+        noise_factor: noise between like cubes over ``noise_hu``; it is subtracted from their
+            difference. 0: nothing is.
 
     Raises:
         ValueError, TypeError: a volume that is not 3-D, real and finite; a setting out of range.
@@ -194,7 +195,7 @@ def nlm(
     u, back = _opened(volume)
     noise = _noise(noise_hu)
     h = number("strength", strength, positive=True) * noise
-    expected = 2.0 * (number("told", told, low=0.0) * noise) ** 2
+    expected = 2.0 * (number("noise_factor", noise_factor, low=0.0) * noise) ** 2
     patch, search = whole("patch", patch, low=0), whole("search", search, low=0)
     wide = _padded(u, search + patch)
     middle = _window(wide, (search,) * 3, torch.Size(n + 2 * patch for n in u.shape))
@@ -276,9 +277,11 @@ def bm4d(
             "only), or use another filter"
         ) from None
     level = float(u.mean())
-    told = noise if covariance is None else noise**2 * _spectrum(covariance, tuple(u.shape))
+    noise_spectrum = (
+        noise if covariance is None else noise**2 * _spectrum(covariance, tuple(u.shape))
+    )
     try:
-        found = np.asarray(package.bm4d(_array(u - level).astype(np.float64), told))
+        found = np.asarray(package.bm4d(_array(u - level).astype(np.float64), noise_spectrum))
     except AttributeError as error:
         # Release 4.2.5 calls a function that NumPy 2.4 has dropped.
         raise ImportError(

@@ -662,7 +662,7 @@ def estimate_motion(
 
     Returns:
         The path with standard errors, and whether the readings hold it; if not, the path is zero
-        and ``warnings`` say so. A jump is said there, too. The errors are those of noise, of a
+        and ``warnings`` say so. A jump is reported there, too. The errors are those of noise, of a
         model of voxels and of what no view sees, under the prior.
 
     Raises:

@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 
 class Result(NamedTuple):
-    """A volume, and what is to be said of it.
+    """A volume, and what speaks against it.
 
     Attributes:
         volume: of a method ``grid.shape`` HU, of a solver ``(..., *grid.shape)`` in the units of
@@ -46,7 +46,7 @@ def tested(name: str, warnings: list[str], test: Callable[..., T], *args: object
 
     Args:
         name: of the test, for the warning.
-        said: warnings of the volume's report; a failure is added.
+        warnings: of the volume's report; a failure is added.
         test: called with ``args``.
 
     Returns:

@@ -29,6 +29,7 @@ FORMER_NAMES = {
     "surround": "exterior",
     "surround_line_integrals": "exterior_line_integrals",
     "surround_weights": "exterior_weights",
+    "told": "noise_factor",
 }
 """Public names that have changed → what they are called now."""
 

@@ -277,10 +277,10 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid, motion: Floats | None = N
     if order.findings and "jump" not in order.sizes:
         return [*order.findings, *columns]
     conjugate = geometry_test(lines, geometry)
-    told = conjugate.findings
+    texts = conjugate.findings
     if order.findings:  # neighbours tell it themselves, or something that looks like it
-        told = tuple(text for text in told if "views scatter" not in text)
-    found = [*_stuck_texts(scan, geometry), *order.findings, *told]
+        texts = tuple(text for text in texts if "views scatter" not in text)
+    found = [*_stuck_texts(scan, geometry), *order.findings, *texts]
     try:
         weights = angular_weights(geometry)
     except ValueError:  # FBP refuses these views, other methods need not

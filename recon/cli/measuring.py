@@ -738,7 +738,7 @@ def add_hardcases(commands: Commands) -> None:
         _own_study,
         registry.STUDIES["hardcases"],
         "Break the plaque's scan in many ways, reconstruct what is left by every method, and "
-        "print the error, what was said, and whether it was wrong without a warning.",
+        "print the error, the warnings, and whether it was wrong without a warning.",
         "torchpcct hardcases --quick",
         "torchpcct hardcases --methods fbp pwls --views 246",
         out="folder for report.html, .md, .json and the figure (default out/hardcases)",

@@ -261,7 +261,7 @@ class Mbir:
         ]
 
     def _solved(self, term: Quadratic, normal: Quadratic) -> tuple[Tensor, list[_Note]]:
-        """u of a batch, and what is to be said of each volume."""
+        """u of a batch, and the warnings of each volume."""
         if self.known is not None:
             return self._around(self.known, term, normal)
         return self.solution(normal), [_Note({}, [])] * len(term.b)
@@ -472,7 +472,7 @@ class _Note(NamedTuple):
 
 
 def _note(known: Known, found: Drawn, why: str) -> _Note:
-    """What is to be said of a scan in which something known was to be drawn."""
+    """Warnings of a scan in which something known was to be drawn."""
     entry = {"drawn": False, "why": why} if why else {"drawn": True}
     text = f"no {known.name} was drawn: {why}" if why else known.caution
     return _Note({**found.report, known.name: entry}, [*found.warnings, text])

@@ -18,7 +18,7 @@ block is found while it is far too weak to be seen in a voxel, and from there on
 A compact body is no pattern: it spreads over many coefficients. So the volume is also asked for the
 ball that it lacks most (:func:`missing_body`), by the matched filter ⟨t, β − H u⟩ over its noise
 (Barrett, Myers 2004, Foundations of Image Science, 13.2.12). It is not put back, as what stands out
-that far is denser than what the prior knows, and half of it comes back by that; it is said.
+that far is denser than what the prior knows, and half of it comes back by that; a warning says so.
 """
 
 from __future__ import annotations

@@ -120,9 +120,9 @@ def found_paths(
     Returns:
         ``case``, ``mm``, ``exposure_s``, ``true_mm`` (root mean square of the motion about its
         mean), ``error_mm`` (of what is applied), ``stated_mm`` (of the standard errors), ``inside``
-        (share within two of them), ``held``, ``jumps`` and ``said`` (how many realisations applied
-        a motion, found a jump, and said that something else moves). None where two vessels have no
-        common path.
+        (share within two of them), ``held``, ``jumps`` and ``warned`` (how many realisations
+        applied a motion, found a jump, and warned that something else moves). None where two
+        vessels have no common path.
     """
     jobs = [
         (case, mm)
@@ -193,7 +193,7 @@ def _row(found: list[InsetMotion], truth: NDArray[np.float64] | None) -> JsonObj
         "stated_mm": rms([f.errors for f in found]),
         "held": sum(f.held for f in found),
         "jumps": sum(f.jump is not None for f in found),
-        "said": sum(any("move differently" in text for text in f.warnings) for f in found),
+        "warned": sum(any("move differently" in text for text in f.warnings) for f in found),
     }
     if truth is None:
         return row | {"true_mm": None, "error_mm": None, "inside": None}

@@ -292,8 +292,8 @@ def compared(found: InsetMotion, truth: Floats, jump: Jump | None) -> JsonObject
     Returns:
         ``true_mm``, ``error_mm`` (of what is applied) and ``stated_mm`` (standard errors), root
         mean squares; ``inside``, the share within two of them; ``held``; ``jumps``, whether a jump
-        was said, ``jump_mm`` its true size, ``jump_error_mm`` how far the one that was said is from
-        it; ``other``, whether something was said to move otherwise.
+        was reported, ``jump_mm`` its true size, ``jump_error_mm`` how far the reported one is from
+        it; ``other``, whether a warning says that something moves otherwise.
     """
     off = found.path - truth
     row: JsonObject = {

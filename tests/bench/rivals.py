@@ -53,7 +53,7 @@ SEARCH: dict[str, dict[str, list[Any]]] = {
         "strength": [0.4, 0.6, 0.8, 1.1, 1.5],
         "patch": [1, 2, 3],
         "search": [3, 4],
-        "told": [0.75, 1.0, 1.25],
+        "noise_factor": [0.75, 1.0, 1.25],
     },
     "tv": {"strength": [0.15, 0.3, 0.5, 0.7, 1.0, 1.5, 2.2, 3.0]},
     "bm4d": {"strength": [0.8, 1.0, 1.25]},

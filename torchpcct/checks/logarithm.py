@@ -167,10 +167,10 @@ def _made(y: Floats) -> _Made | None:
         return None
     fits = {beyond: _units(classes, beyond) for beyond in _BEYOND}
     counted = {k: _counted(y, groups, fits[k][0], k == -0.5) for k in (0.0, -0.5, -1.0)}
-    told = max(counted, key=lambda k: counted[k][0])
-    alike = (-0.5,) if told == -0.5 else (-1.0, 0.0)
+    clearest = max(counted, key=lambda k: counted[k][0])
+    alike = (-0.5,) if clearest == -0.5 else (-1.0, 0.0)
     unlike = max(score for k, (score, _) in counted.items() if k not in alike)
-    if counted[told][0] > max(_TOLD, unlike + _CLEARLY):  # 0 or 1 were added, or a half
+    if counted[clearest][0] > max(_TOLD, unlike + _CLEARLY):  # 0 or 1 were added, or a half
         fits = {k: (counted[k][1], _misfit(classes, counted[k][1], k)) for k in alike}
     beyond = min(fits, key=lambda k: fits[k][1])
     others = [fit[1] for k, fit in fits.items() if k * beyond <= 0.0 and k != beyond]

@@ -597,8 +597,8 @@ def stuck_views(readings: Tensor, geometry: Geometry) -> list[str]:
     apart = np.diff(angles) > 1e-9
     values, counts = np.unique(n[:: max(1, g.views // 64)], return_counts=True)
     popular = values[counts > _POPULAR * counts.sum()]
-    told = np.isfinite(n) & (n != 0.0) & ~np.isin(n, popular)
-    both = told[1:] & told[:-1]
+    telling = np.isfinite(n) & (n != 0.0) & ~np.isin(n, popular)
+    both = telling[1:] & telling[:-1]
     equal = both & (n[1:] == n[:-1])
     edges = np.arange(0, g.columns - _STUCK_COLUMNS + 1, _STUCK_COLUMNS)
     same, of = (np.add.reduceat(v.sum(1), edges, axis=1).astype(np.float64) for v in (equal, both))
@@ -611,7 +611,7 @@ def stuck_views(readings: Tensor, geometry: Geometry) -> list[str]:
     few = chance < 0.3
     unlikely = of * np.log(np.maximum(chance, 0.05)) < math.log(_CHANCE / max(int(enough.sum()), 1))
     stuck = enough & few & (same >= _STUCK_SHARE * of) & (of > 0) & unlikely
-    later = _copies(n, told, angles)
+    later = _copies(n, telling, angles)
     # Readings without noise repeat where nothing moves: noise of neighbouring columns has nothing
     # in common.
     if not (stuck.any() or later) or not _noisy(n, edges, stuck):
@@ -674,12 +674,12 @@ def _dark_columns(n: NDArray[np.float32], order: NDArray[np.int64]) -> list[str]
     ]
 
 
-def _copies(n: NDArray[np.float32], told: NDArray[np.bool_], angles: Floats) -> list[int]:
+def _copies(n: NDArray[np.float32], telling: NDArray[np.bool_], angles: Floats) -> list[int]:
     """Whole views that repeat another one at a different angle, most of whose readings say
     something."""
     first: dict[bytes, int] = {}
     found = []
-    whole = np.flatnonzero(told.mean((1, 2)) > 0.5).tolist()
+    whole = np.flatnonzero(telling.mean((1, 2)) > 0.5).tolist()
     for k in whole:
         before = first.setdefault(hashlib.sha256(n[k].tobytes()).digest(), k)
         if before != k and abs(angles[k] - angles[before]) > 1e-9:

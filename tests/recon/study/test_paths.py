@@ -43,7 +43,7 @@ def test_an_estimate_is_compared_with_the_truth():
 @pytest.mark.extended
 def test_report(tiny, tmp_path):
     study = tiny("paths")
-    data = assert_report_is_whole(study, tmp_path, {"paths.png"}, ("jump was said", "at rest"))
+    data = assert_report_is_whole(study, tmp_path, {"paths.png"}, ("jump was reported", "at rest"))
     rest, line = data["paths"]
     assert not rest["held"]
     assert line["held"]
