@@ -9,6 +9,7 @@ come from YAML or from Python.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from importlib import resources
@@ -33,6 +34,8 @@ __all__ = ["DataConfig", "ObjectiveConfig", "TrainConfig", "load_config"]
 
 LONGEST_INTERVAL = 120.0
 """Largest ``checkpoint_seconds``: what a killed run may lose, in s."""
+VALIDATED_AT_ONCE = 4
+"""Scenes that a validation reconstructs at a time."""
 
 
 def _set(config: object, **values: object) -> None:
@@ -348,6 +351,19 @@ class TrainConfig:
         if not isinstance(self.bfloat16, bool):
             raise TypeError(f"bfloat16 must be true or false, got {self.bfloat16!r}")
         _set(self, network=_network(self.network))
+        kinds = len(self.data.situations)
+        pools = [
+            ("data.scenes_kept", self.data.scenes_kept, self.batch),
+            ("objective.held_out", self.objective.held_out, VALIDATED_AT_ONCE),
+        ]
+        if self.late_begins < self.steps:
+            pools.append(("late.scenes_kept", self.late.scenes_kept, self.batch))
+        for name, scenes, batch in pools:
+            if math.ceil(scenes / kinds) < batch:
+                raise ValueError(
+                    f"{name} must be at least {kinds * (batch - 1) + 1}, got {scenes}: scenes of "
+                    f"{batch} are taken at a time, all of one of the {kinds} situations"
+                )
 
     @property
     def decay_begins(self) -> int:

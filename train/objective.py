@@ -35,7 +35,7 @@ from recon.data_term import Quadratic
 from recon.mbir.network import bilateral_prior
 from recon.mbir.priors import Prior
 from recon.mbir.unrolled import DEFAULT_FIDELITY, Views
-from train.config import ObjectiveConfig
+from train.config import VALIDATED_AT_ONCE, ObjectiveConfig
 from train.data import Batch, Data
 
 _TAME_ERROR = 0.02
@@ -47,8 +47,6 @@ _NOISE_FREE_SHARE = 0.5
 """Share of the scenes that are seen without noise too; there that counts so many times more."""
 _LEAST_CONTRAST_HU = 10.0
 """Contrasts below are none: what is read there is invented."""
-_AT_ONCE = 4
-"""Scenes that a validation reconstructs at a time."""
 _FLAT_VOXELS = 5
 """Width of the cube in which the truth must be constant, in voxels of 0.2 mm."""
 _FLAT_HU = 10.0
@@ -170,8 +168,8 @@ class Objective:
         """
         rows: list[dict[str, float]] = []
         pictures: dict[str, NDArray[np.float32]] = {}
-        for step in range(held_out.batches_in_epoch(_AT_ONCE)):
-            batch = held_out.batch(step, _AT_ONCE, range(_AT_ONCE))
+        for step in range(held_out.batches_in_epoch(VALIDATED_AT_ONCE)):
+            batch = held_out.batch(step, VALIDATED_AT_ONCE, range(VALIDATED_AT_ONCE))
             problem, views = batch.volumes(torch.arange(batch.size))
             scale = problem.unit_hu.reshape(-1, 1, 1, 1)
 
@@ -217,9 +215,14 @@ class Objective:
         score = 0.0
         for name, chosen in (("low", scales >= middle_scale), ("high", scales < middle_scale)):
             of = {k: np.array([r[k] for r in rows])[chosen] for k in rows[0]}
-            for key, label in (("inside", "error"), ("all", "all")):
+            for key, label, counts in (("inside", "error", 1.0), ("all", "all", 0.5)):
                 ratio = np.log(of[f"made_{key}"] / of[f"simple_{key}"])
-                figures[f"{label}_{name}"] = float(np.exp(0.5 * np.nanmean(ratio)))
+                ratio = ratio[np.isfinite(of[f"simple_{key}"])]  # of scenes that hold a body
+                figures[f"{label}_{name}"] = (
+                    float(np.exp(0.5 * ratio.mean())) if ratio.size else math.nan
+                )
+                if ratio.size:
+                    score -= counts * math.log(figures[f"{label}_{name}"])
             has, real = of["has"] > 0, np.abs(of["true"]) > _LEAST_CONTRAST_HU
             both = has & real
             slope = (of["true"] * of["read"])[both].sum() / max(
@@ -229,7 +232,6 @@ class Objective:
             figures[f"false_hu_{name}"] = (
                 float(np.abs(of["read"])[has & ~real].mean()) if (has & ~real).any() else 0.0
             )
-            score -= math.log(figures[f"error_{name}"]) + 0.5 * math.log(figures[f"all_{name}"])
         return Validation(score, figures, pictures)
 
 

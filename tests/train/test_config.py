@@ -57,6 +57,18 @@ def test_sections_from_plain_values():
         ("single: 1.5", "single must lie in"),
         ("bfloat16: 1", "bfloat16 must be true or false"),
         ("data: {scenes_kept: 0}", "data: scenes_kept must be at least 1"),
+        (
+            "batch: 4\ndata: {scenes_kept: 6, situations: [{x: 1, y: 2}, {x: 2, y: 1}]}",
+            r"data\.scenes_kept must be at least 7, got 6: .* one of the 2 situations",
+        ),
+        (
+            "late: {begins: 0.5, scenes_kept: 3}\nbatch: 4\ndata: {situations: [{x: 1, y: 2}]}",
+            r"late\.scenes_kept must be at least 4, got 3",
+        ),
+        (
+            "objective: {held_out: 6}\ndata: {situations: [{x: 1, y: 2}, {x: 2, y: 1}]}",
+            r"objective\.held_out must be at least 7, got 6",
+        ),
         ("decay: 1.5", "decay must lie in"),
         ("network: {gate: true}", "network: gate needs the filtered view"),
         ("- 3", "mapping"),

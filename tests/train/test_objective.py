@@ -186,6 +186,19 @@ def test_validation_is_relative_to_the_filter(data):
     assert worse.score < found.score - 0.5
     again = Objective().validate(model, held_out)
     assert again.figures == worse.figures
+    # Scenes without a body leave their figure open, and the score to whole volumes.
+    drawn = held_out.batch
+
+    def empty(*given):
+        batch = drawn(*given)
+        return replace(batch, bodies=torch.zeros_like(batch.bodies))
+
+    held_out.batch = empty
+    without = Objective().validate(model, held_out)
+    assert math.isnan(without.figures["error_low"])
+    assert without.score == pytest.approx(
+        -0.5 * math.log(worse.figures["all_low"] * worse.figures["all_high"])
+    )
 
 
 def test_edges_reach_two_voxels_to_either_side():

@@ -36,10 +36,9 @@ def _edges(lines, cell):
 
 
 @triton.jit
-def _crossing(p0, q0, p1, q1, r, bits, ulp, number: tl.constexpr):
-    """Of a cell in slab r the lower end of its overlap: whole voxel and what lies beside it; and
-    its width, all in voxels."""
-    ta, tb = p0 + q0 * r, p1 + q1 * r
+def _crossing(ta, tb, bits, ulp, number: tl.constexpr):
+    """Of a cell whose edges cross a slab at ta and tb the lower end of its overlap: whole voxel and
+    what lies beside it; and its width, all in voxels."""
     low = tl.minimum(ta, tb)
     k = low >> bits
     part = (low - (k << bits)).to(number) * ulp
@@ -142,13 +141,14 @@ def project_plane(
     )
     ulp, nearest = tl.load(numbers), tl.load(numbers + 1)
     image = images + (batch * 2 + axis) * (ny * nx)
-    p0, q0, p1, q1 = _edges(lines, cell)
+    ta, qa, tb, qb = _edges(lines, cell)
     acc = tl.zeros((BLOCK,), dtype=number)
     for r in tl.range(0, most):
         seen = inside & (r < slabs)
         if not PARALLEL:
             seen = seen & (l0 + l1 * r > nearest)
-        k0, part, wide = _crossing(p0, q0, p1, q1, r, bits, ulp, number)
+        k0, part, wide = _crossing(ta, tb, bits, ulp, number)
+        ta, tb = ta + qa, tb + qb
         first = tl.maximum(k0, 0)
         scale = path / wide
         for m in tl.range(0, count):
@@ -197,41 +197,41 @@ def project_cone(
     pitch, layered = tl.load(numbers + 4), tl.abs(l1) < tl.load(numbers + 3)
     source, climb = tl.load(heights + view * 5), tl.load(heights + view * 5 + 1)
     volume = sums + batch * ny * nx * knots
-    p0, q0, p1, q1 = _edges(lines, cell)
+    ta, qa, tb, qb = _edges(lines, cell)
     acc0, acc1 = tl.zeros((BLOCK,), dtype=number), tl.zeros((BLOCK,), dtype=number)
     acc2, acc3 = tl.zeros((BLOCK,), dtype=number), tl.zeros((BLOCK,), dtype=number)
     for r in tl.range(0, slabs):
-        k0, part, wide = _crossing(p0, q0, p1, q1, r, bits, ulp, number)
+        k0, part, wide = _crossing(ta, tb, bits, ulp, number)
+        ta, tb = ta + qa, tb + qb
         depth = l0 + l1 * r
         first = tl.maximum(k0, 0)
         stop = tl.minimum(k0 + tl.ceil(part + wide).to(tl.int32), width)
-        stop = tl.where(depth > nearest, stop, first)
-        whole = tl.floor(depth / layer)
-        upper = depth / layer - whole
-        at = tl.where(layered, whole * layer, depth)
-        share = tl.where(layered, 1.0 - upper, 1.0)
-        slab = volume + (r * across).to(tl.int64) * knots
-        step = at * pitch
-        place = source + at * climb + step * beside
-        d0, d1, d2, d3 = _four_rows(
-            slab, first, stop, along, knots, k0, part, wide, place, step, last
-        )
-        scale = tl.where(stop > first, path / wide * share / step, 0.0)  # the depth may be 0
-        acc0 += scale * d0
-        acc1 += scale * d1
-        acc2 += scale * d2
-        acc3 += scale * d3
-        if layered & (upper > 0):
-            step = (at + layer) * pitch
-            place = source + (at + layer) * climb + step * beside
+        if (first < stop) & (depth > nearest):
+            whole = tl.floor(depth / layer)
+            upper = depth / layer - whole
+            at = tl.where(layered, whole * layer, depth)
+            share = path / wide * tl.where(layered, 1.0 - upper, 1.0)
+            slab = volume + (r * across).to(tl.int64) * knots
+            step = at * pitch
+            place = source + at * climb + step * beside
             d0, d1, d2, d3 = _four_rows(
                 slab, first, stop, along, knots, k0, part, wide, place, step, last
             )
-            scale = tl.where(stop > first, path / wide * upper / step, 0.0)
-            acc0 += scale * d0
-            acc1 += scale * d1
-            acc2 += scale * d2
-            acc3 += scale * d3
+            acc0 += share / step * d0
+            acc1 += share / step * d1
+            acc2 += share / step * d2
+            acc3 += share / step * d3
+            if layered & (upper > 0):
+                share = path / wide * upper
+                step = (at + layer) * pitch
+                place = source + (at + layer) * climb + step * beside
+                d0, d1, d2, d3 = _four_rows(
+                    slab, first, stop, along, knots, k0, part, wide, place, step, last
+                )
+                acc0 += share / step * d0
+                acc1 += share / step * d1
+                acc2 += share / step * d2
+                acc3 += share / step * d3
     rise, pitch = tl.load(heights + view * 5 + 2), tl.load(numbers + 5)
     rise = rise + pitch * beside
     target = out + ((batch * views + view) * rows + row) * columns + column
@@ -325,7 +325,7 @@ def backproject_plane(
             column = first + tl.where(backward, cells - 1 - c, c)
             cell = view * columns + column
             p0, q0, p1, q1 = _edges(lines, cell)
-            k0, part, breadth = _crossing(p0, q0, p1, q1, r, bits, ulp, number)
+            k0, part, breadth = _crossing(p0 + q0 * r, p1 + q1 * r, bits, ulp, number)
             near = (k0 - k).to(number) + part
             w = tl.minimum(near + breadth, 1.0) - tl.maximum(near, 0.0)
             good = (j + m < cells) & (k < width) & (w > 0)
@@ -391,7 +391,7 @@ def backproject_cone(
             column = first + tl.where(backward, cells - 1 - c, c)
             cell = view * columns + column
             p0, q0, p1, q1 = _edges(lines, cell)
-            k0, part, breadth = _crossing(p0, q0, p1, q1, r, bits, ulp, number)
+            k0, part, breadth = _crossing(p0 + q0 * r, p1 + q1 * r, bits, ulp, number)
             near = (k0 - k).to(number) + part
             w = tl.minimum(near + breadth, 1.0) - tl.maximum(near, 0.0)
             l1 = tl.load(depths + cell * 4 + 1)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from torchpcct.typing import Floats
 
 LANES = 128
-"""Columns or voxels of a program of a plane, rows of one of a cone beam, and half of its slices."""
+"""Columns or voxels of a program of a plane; of a cone beam at most twice as many rows or slices."""
 _STEPS = 2
 """Steps of a segment's look-up table for each of its columns."""
 
@@ -150,7 +150,7 @@ class GpuPasses:
         sums = x.new_zeros((batch, ny, nx, nz + 1))
         torch.cumsum(x.permute(0, 2, 3, 1), dim=-1, out=sums[..., 1:])
         fours = math.ceil(rays.rows / 4)
-        block = min(max(1, self.lanes // 4), _power_of_two(fours))
+        block = _block(fours, max(1, self.lanes // 2))
         kernels.project_cone[(rays.views * rays.columns, math.ceil(fours / block), batch)](
             sums,
             out,
@@ -169,7 +169,7 @@ class GpuPasses:
             rays.columns,
             rays.rows // 2,
             BLOCK=block,
-            num_warps=_warps(block, 32),
+            num_warps=_warps(block, 64),
         )
 
     def adjoint(self, y: Tensor) -> Tensor:
@@ -230,7 +230,7 @@ class GpuPasses:
                     )
                     continue
                 fours = math.ceil(nz / 4)
-                block = min(max(1, self.lanes // 2), _power_of_two(fours))
+                block = _block(fours, max(1, self.lanes // 2))
                 kernels.backproject_cone[(slabs * width, math.ceil(fours / block), batch)](
                     *given,
                     of.heights,
@@ -398,6 +398,15 @@ def _warps(lanes: int, each: int) -> int:
     """Warps of a program whose threads hold ``each / 32`` lanes: more where a thread's own
     arithmetic is shared by all of its lanes."""
     return max(1, min(8, lanes // each))
+
+
+def _block(lanes: int, most: int) -> int:
+    """Lanes of a program: as many as allowed, or half of that where it leaves fewer idle."""
+    block = min(most, _power_of_two(lanes))
+    half = max(1, block // 2)
+    return (
+        half if math.ceil(lanes / half) * half < 0.9 * math.ceil(lanes / block) * block else block
+    )
 
 
 def _power_of_two(n: int) -> int:
