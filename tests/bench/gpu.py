@@ -6,9 +6,9 @@ training?
 One command without arguments, for the first minutes on a card: versions; agreement of every Triton
 kernel with the CPU in float32 and float64 (forward, adjoint, the identity between both, gradients),
 of FBP, PWLS and MBIR; times by CUDA events (median of 5 after a first call) beside those of
-torchtomo and diffct where these are installed; what the memory of the card would allow; a minute of
-training with its scenes per second. What fails, and what there was no time for, stands in the table
-as such.
+torchtomo and diffct where these are installed; whole reconstructions on the card and on the CPU;
+half a minute of training with its scenes per second. What fails, and what there was no time for,
+stands in the table as such.
 
 Without a card it says so and ends. With TRITON_INTERPRET=1 it runs at tiny sizes on the CPU, the
 kernels by Triton's interpreter: that tests this program, not the card.
@@ -36,9 +36,11 @@ import torch
 from recon.analytic.backproject import BackprojectionPlan
 from recon.analytic.fbp import fbp
 from recon.api import reconstruct
-from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, Scan, VolumeGrid
+from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, Scan, VolumeGrid, acquire
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import full_turn
+from torchpcct.scanner import presets
+from torchpcct.scene.plaque import plaque_scene
 from train.__main__ import build
 from train.config import LateConfig, load_config
 from train.processes import Group, gradient
@@ -50,7 +52,7 @@ SLOWEST_S = 20.0
 """First calls that take longer are not repeated."""
 ROUNDS = 5
 """Calls that a median is of."""
-TRAINING_S = 45.0
+TRAINING_S = 25.0
 GOALS_MS = {
     ("cone 256³, 360 × 384²", "forward"): 100,
     ("cone 256³, 360 × 384²", "adjoint"): 150,
@@ -211,7 +213,11 @@ def chain_agreement(bench: Bench, method: str, kind: str, **options: Any) -> dic
 
 
 def chain_scan(kind: str, tiny: bool) -> tuple[Scan, VolumeGrid]:
-    n, views = (8, 12) if tiny else (64, 180)
+    return field_scan(kind, *((8, 12) if tiny else (64, 180)))
+
+
+def field_scan(kind: str, n: int, views: int) -> tuple[Scan, VolumeGrid]:
+    """Noisy scan of a disc of water, and a grid of n voxels of 100 mm in all."""
     turn, pitch = full_turn(views), 3.2 * 64 / n
     if kind == "fan":
         geometry: Any = FanBeam(turn, 300.0, 600.0, n * 3 // 2, pitch)
@@ -283,7 +289,7 @@ def diffct(bench: Bench, geometry: Any, grid: VolumeGrid) -> dict[str, Callable[
 def torchtomo(bench: Bench, geometry: Any, grid: VolumeGrid) -> dict[str, Callable[[], Any]]:
     import torchtomo as peer
 
-    beta = torch.from_numpy(geometry.angles)
+    beta = torch.tensor(geometry.angles)
     radial = torch.stack([beta.cos(), beta.sin(), 0 * beta], 1)
     tangent = torch.stack([-beta.sin(), beta.cos(), 0 * beta], 1)
     if isinstance(geometry, ConeBeam):
@@ -373,6 +379,50 @@ def bandwidth(bench: Bench) -> dict[str, float]:
         "copy_gb_s": 8e-6 * n / found.get("ms", found["first_ms"]),
         "fp32_tflop_s": 2e-9 * size**3 / product.get("ms", product["first_ms"]),
     }
+
+
+# -- whole reconstructions -------------------------------------------------------------------------
+
+
+def reconstructed_scans(tiny: bool) -> dict[str, tuple[Scan, VolumeGrid, tuple[str, ...], bool]]:
+    """Scan, grid, methods, and whether the CPU computes them, too."""
+    scene, plaque = plaque_scene(vessel_length=6.0)
+    size = (5, 8, 8) if tiny else (33, 39, 39)
+    inset = VolumeGrid(size, 0.2, plaque.position[::-1])
+    scanner = presets.pcct(views=246 if tiny else 1968, rows=8 if tiny else 28)
+    window = acquire(scene, scanner, exposure_s=2.0, seed=0, region=inset, duty=1 / 4)
+    n, views = (8, 12) if tiny else (512, 720)
+    fan, plane = field_scan("fan", n, views)
+    m, turn = (8, 12) if tiny else (128, 180)
+    cone, volume = field_scan("cone", m, turn)
+    return {
+        "inset of the paper, 33 × 39², 1 968 views": (window, inset, ("fbp", "pwls", "mbir"), True),
+        f"fan beam {n}², {views} views": (fan, plane, ("fbp", "pwls"), True),
+        f"cone beam {m // 4} × {m}², {turn} views": (cone, volume, ("fbp", "pwls"), False),
+    }
+
+
+def whole_seconds(
+    bench: Bench, scan: Scan, grid: VolumeGrid, method: str, on_cpu: bool
+) -> dict[str, Any]:
+    """Of ``recon.reconstruct``, tests of the data among it: the first call on the device, which
+    compiles and fits what a scan keeps, the next one, and that of the CPU with all its threads."""
+
+    def seconds(device: torch.device | str) -> tuple[float, Any]:
+        begun = time.perf_counter()
+        volume = reconstruct(scan, grid, method, device=device)
+        volume.data.cpu()
+        return time.perf_counter() - begun, volume
+
+    first, there = seconds(bench.device)
+    found = {"first_s": first, "next_s": seconds(bench.device)[0]}
+    if on_cpu:
+        seconds("cpu")
+        found["cpu_next_s"], here = seconds("cpu")
+        off = (there.data.cpu() - here.data).square().mean().sqrt()
+        found["hu_rms_apart"] = float(off)
+        found["agrees"] = bool(off < 0.2)
+    return found
 
 
 # -- training --------------------------------------------------------------------------------------
@@ -517,6 +567,14 @@ def main() -> None:
     bench.run("chain", "mbir, fan", lambda: chain_agreement(bench, "mbir", "fan"))
     bench.run("card", "at best", lambda: bandwidth(bench))
     timed(bench)
+    for what, (scan, grid, methods, on_cpu) in reconstructed_scans(tiny).items():
+        for method in methods:
+            given = scan, grid, method, on_cpu
+            bench.run(
+                "whole",
+                f"{method}, {what}",
+                lambda given=given: whole_seconds(bench, *given),
+            )
     bench.run("training", "network of MBIR", lambda: training(bench))
     seconds = time.perf_counter() - bench.began
     text = table(about, bench.rows, seconds)
