@@ -65,7 +65,7 @@ from torchpcct.vector_geometry import check_motion
 if TYPE_CHECKING:
     from torchpcct.typing import JsonObject
 
-__all__ = ["InsetMotion", "Jump", "estimate_motion", "path_of"]
+__all__ = ["InsetMotion", "Jump", "PathTooLongError", "estimate_motion", "path_of"]
 
 _LOG = logging.getLogger(__name__)
 Floats = NDArray[np.float64]
@@ -143,6 +143,10 @@ _ANOTHER = 3.0
 """Times that, beside what noise leaves, from which on something else moves."""
 _CHANCE = 1.05
 """Times what a draw of the noise leaves, from which on another draw is not the cause."""
+
+
+class PathTooLongError(ValueError):
+    """The inset moves further than is looked for, or too little of it can be seen to tell."""
 
 
 @dataclass(frozen=True)
@@ -666,8 +670,9 @@ def estimate_motion(
         model of voxels and of what no view sees, under the prior.
 
     Raises:
-        ValueError: an unknown exterior, energy bins, another geometry, fewer than 48 views, a path
-            longer than 2.5 mm from its mean, a heart's rate without the time of a turn.
+        ValueError: an unknown exterior, energy bins, another geometry, fewer than 48 views, a
+            heart's rate without the time of a turn. PathTooLongError: a path that leads further
+            than 2.5 mm away from its mean.
         TypeError: no :class:`torchpcct.Scan`.
     """
     _require_inset(scan)
@@ -769,7 +774,7 @@ def _followed(
         before: iterations done before.
 
     Raises:
-        ValueError: a path longer than is looked for.
+        PathTooLongError: a path longer than is looked for.
     """
     effects: _Effects | None = None
     for step in range(1, _STEPS + 1):
@@ -783,7 +788,7 @@ def _followed(
         at = at + (belief.mean - at) / max(1.0, largest / _LARGEST_STEP_MM)
         farthest = float(np.abs(problem.path(at)).max())
         if farthest > _REACH_MM:
-            raise ValueError(
+            raise PathTooLongError(
                 f"the path that fits leads {farthest:.2g} mm away from its mean, more than the "
                 f"{_REACH_MM:g} mm that are looked for: the inset moves too far in this scan, or "
                 "what it holds is too faint for its motion to be found"

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recon.jobs.store import Pieces
-from recon.motion import InsetMotion, estimate_motion
+from recon.motion import InsetMotion, PathTooLongError, estimate_motion
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import SCANNERS, duty
 from torchpcct.acquisition.acquire import acquire
@@ -26,7 +26,7 @@ from torchpcct.scene.plaque import Plaque, plaque_scene
 if TYPE_CHECKING:
     from torchpcct.typing import JsonObject
 
-__all__ = ["CASES", "AlongAxis", "Jump", "found_paths"]
+__all__ = ["CASES", "AlongAxis", "Jump", "found_paths", "motion_or_refusal"]
 
 _SECOND_MM = (-3.3, 0.0)
 """Where the second vessel lies beside the plaque's, x and y, on the side away from the plaque."""
@@ -120,9 +120,10 @@ def found_paths(
     Returns:
         ``case``, ``mm``, ``exposure_s``, ``true_mm`` (root mean square of the motion about its
         mean), ``error_mm`` (of what is applied), ``stated_mm`` (of the standard errors), ``inside``
-        (share within two of them), ``held``, ``jumps`` and ``warned`` (how many realisations
-        applied a motion, found a jump, and warned that something else moves). None where two
-        vessels have no common path.
+        (share within two of them), ``refused``, ``held``, ``jumps`` and ``warned`` (in how many
+        realisations no path was found as it leads too far, a motion was applied, a jump was
+        found, a warning said that something else moves). None where two vessels have no common
+        path, or all are refused.
     """
     jobs = [
         (case, mm)
@@ -181,22 +182,36 @@ def _truth(
     return path - path.mean(0)
 
 
-def _estimates(scan: Scan, grid: VolumeGrid, exposure_s: float, seeds: range) -> list[InsetMotion]:
-    return [estimate_motion(scan.with_noise(exposure_s, seed), grid) for seed in seeds]
+def _estimates(
+    scan: Scan, grid: VolumeGrid, exposure_s: float, seeds: range
+) -> list[InsetMotion | None]:
+    return [motion_or_refusal(scan.with_noise(exposure_s, seed), grid) for seed in seeds]
 
 
-def _row(found: list[InsetMotion], truth: NDArray[np.float64] | None) -> JsonObject:
+def motion_or_refusal(scan: Scan, grid: VolumeGrid) -> InsetMotion | None:
+    """What is found, or None where the estimate is refused: the path leads too far."""
+    try:
+        return estimate_motion(scan, grid)
+    except PathTooLongError:
+        return None
+
+
+def _row(estimates: list[InsetMotion | None], truth: NDArray[np.float64] | None) -> JsonObject:
     def rms(values: list[NDArray[np.float64]] | NDArray[np.float64]) -> float:
         return float(np.sqrt((np.asarray(values) ** 2).sum(-1).mean()))
 
+    found = [one for one in estimates if one is not None]
     row: JsonObject = {
-        "stated_mm": rms([f.errors for f in found]),
+        "refused": len(estimates) - len(found),
+        "stated_mm": rms([f.errors for f in found]) if found else None,
         "held": sum(f.held for f in found),
         "jumps": sum(f.jump is not None for f in found),
         "warned": sum(any("move differently" in text for text in f.warnings) for f in found),
     }
     if truth is None:
         return row | {"true_mm": None, "error_mm": None, "inside": None}
+    if not found:
+        return row | {"true_mm": rms(truth), "error_mm": None, "inside": None}
     inside = [np.abs(f.path - truth) <= 2.0 * f.errors for f in found]
     return row | {
         "true_mm": rms(truth),

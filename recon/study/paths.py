@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from recon.api import reconstruct
 from recon.jobs.store import Pieces, Step
-from recon.motion import InsetMotion, estimate_motion
+from recon.motion import InsetMotion
 from recon.study.figures import curve_axes
-from recon.study.motion_found import AlongAxis, Jump
+from recon.study.motion_found import AlongAxis, Jump, motion_or_refusal
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import duty
 from recon.study.study import Measured, Progress, StudySettings, silent
@@ -209,7 +209,8 @@ def measure(
             for exposure, one, cpu in zip(s.exposures_s, found, seconds, strict=True):
                 row = {"kind": kind, "vessel": vessel, "exposure_s": exposure, "cpu_seconds": cpu}
                 rows.append(row | compared(one, truth, jump))
-            seen.examples.setdefault(kind, (truth, found[0]))
+            if found[0] is not None:
+                seen.examples.setdefault(kind, (truth, found[0]))
             progress(kind, (done + 1) / s.vessels)
     mbir = pieces("mbir", partial(_mbir_seconds, s))
     summary = [
@@ -237,21 +238,21 @@ def _step(s: PathsSettings) -> Step:
 
 def _path(
     s: PathsSettings, pieces: Pieces, kind: str, vessel: int
-) -> tuple[Floats, Motions, list[InsetMotion], list[float]]:
+) -> tuple[Floats, Motions, list[InsetMotion | None], list[float]]:
     """The piece of one vessel."""
     return pieces.within(kind.replace(" ", "_"))(f"{vessel}", partial(_estimated, s, kind, vessel))
 
 
 def _estimated(
     s: PathsSettings, kind: str, vessel: int
-) -> tuple[Floats, Motions, list[InsetMotion], list[float]]:
+) -> tuple[Floats, Motions, list[InsetMotion | None], list[float]]:
     """True path, motions, and what was found at each exposure in how much processor time."""
     scene, grid, motions = drawn(kind, vessel)
     scan = _scan(s, scene, grid)
     found, seconds = [], []
     for exposure in s.exposures_s:
         began = time.process_time()
-        found.append(estimate_motion(_noisy(s, scan, exposure, vessel), grid))
+        found.append(motion_or_refusal(_noisy(s, scan, exposure, vessel), grid))
         seconds.append(time.process_time() - began)
     return true_path(motions, scan), motions, found, seconds
 
@@ -286,17 +287,25 @@ def true_path(motions: Sequence[SinusoidalMotion], scan: Scan) -> Floats:
     return path - path.mean(0)
 
 
-def compared(found: InsetMotion, truth: Floats, jump: Jump | None) -> JsonObject:
-    """One estimate beside the truth.
+def compared(found: InsetMotion | None, truth: Floats, jump: Jump | None) -> JsonObject:
+    """One estimate, or none as it was refused, beside the truth.
 
     Returns:
-        ``true_mm``, ``error_mm`` (of what is applied) and ``stated_mm`` (standard errors), root
-        mean squares; ``inside``, the share within two of them; ``held``; ``jumps``, whether a jump
-        was reported, ``jump_mm`` its true size, ``jump_error_mm`` how far the reported one is from
-        it; ``other``, whether a warning says that something moves otherwise.
+        ``refused``; ``true_mm``, ``error_mm`` (of what is applied) and ``stated_mm`` (standard
+        errors), root mean squares; ``inside``, the share within two of them; ``held``; ``jumps``,
+        whether a jump was reported, ``jump_mm`` its true size, ``jump_error_mm`` how far the
+        reported one is from it; ``other``, whether a warning says that something moves otherwise.
     """
+    if found is None:
+        nothing = ("error_mm", "stated_mm", "inside", "jump_error_mm")
+        return {"refused": True, "held": False, "jumps": False, "other": False} | {
+            "true_mm": _rms(truth),
+            "jump_mm": None if jump is None else jump.amplitude,
+            **dict.fromkeys(nothing),
+        }
     off = found.path - truth
     row: JsonObject = {
+        "refused": False,
         "true_mm": _rms(truth),
         "error_mm": _rms(off),
         "stated_mm": _rms(found.errors),
@@ -318,20 +327,29 @@ def _rms(path: Floats) -> float:
 
 
 def _together(rows: list[JsonObject]) -> JsonObject:
-    """Of several paths: root mean squares, the largest error, how many."""
+    """Of several paths: root mean squares, the largest error, how many. Errors are those of the
+    paths that were found, None if there is none."""
+    found = [row for row in rows if not row["refused"]]
     of: dict[str, Floats] = {
-        name: np.array([row[name] for row in rows], dtype=np.float64)
-        for name in ("true_mm", "error_mm", "stated_mm", "inside", "held", "jumps", "other")
+        name: np.array([row[name] for row in found], dtype=np.float64)
+        for name in ("error_mm", "stated_mm", "inside")
     }
-    squares = ("true_mm", "error_mm", "stated_mm")
+    errors: JsonObject = dict.fromkeys(
+        ("error_mm", "stated_mm", "median_mm", "largest_mm", "inside")
+    )
+    if found:
+        errors = {
+            **{name: float(np.sqrt((of[name] ** 2).mean())) for name in ("error_mm", "stated_mm")},
+            "median_mm": float(np.median(of["error_mm"])),
+            "largest_mm": float(of["error_mm"].max()),
+            "inside": float(of["inside"].mean()),
+        }
     return {
         "n": len(rows),
-        **{name: float(np.sqrt((of[name] ** 2).mean())) for name in squares},
-        "median_mm": float(np.median(of["error_mm"])),
-        "largest_mm": float(of["error_mm"].max()),
-        "inside": float(of["inside"].mean()),
+        "true_mm": float(np.sqrt(np.mean([row["true_mm"] ** 2 for row in rows]))),
+        **errors,
         "covered": int((of["inside"] >= _COVERED).sum()),
-        **{name: int(of[name].sum()) for name in ("held", "jumps", "other")},
+        **{name: sum(row[name] for row in rows) for name in ("refused", "held", "jumps", "other")},
         "cpu_seconds": float(np.median([row["cpu_seconds"] for row in rows])),
     }
 

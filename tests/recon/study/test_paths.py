@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from tiny_studies import assert_report_is_whole
 
-from recon.motion import InsetMotion
+from recon.motion import InsetMotion, PathTooLongError
 from recon.motion import Jump as Said
+from recon.study import motion_found
 from recon.study.motion_found import Jump
-from recon.study.paths import KINDS, SMOOTH, compared, drawn
+from recon.study.paths import KINDS, SMOOTH, _together, compared, drawn
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -38,6 +39,24 @@ def test_an_estimate_is_compared_with_the_truth():
     assert row["other"]
     assert row["jump_error_mm"] == pytest.approx(0.1)
     assert compared(found, truth, None)["jump_mm"] is None
+    # A refused estimate has no error, and changes none.
+    refused = compared(None, truth, Jump("wall", 0.4, at_s=0.1))
+    assert refused["refused"]
+    assert refused["true_mm"] == row["true_mm"]
+    both = _together([r | {"cpu_seconds": 1.0} for r in (row, refused)])
+    assert (both["n"], both["refused"], both["jumps"]) == (2, 1, 1)
+    assert both["error_mm"] == row["error_mm"]
+    assert _together([refused | {"cpu_seconds": 1.0}])["error_mm"] is None
+
+
+def test_a_path_that_leads_too_far_is_no_end_of_a_study(monkeypatch):
+    def too_far(scan, grid):
+        raise PathTooLongError("2.7 mm")
+
+    monkeypatch.setattr(motion_found, "estimate_motion", too_far)
+    assert motion_found.motion_or_refusal(None, None) is None
+    row = motion_found._row([None, None], np.ones((4, 3)))
+    assert (row["refused"], row["held"], row["error_mm"]) == (2, 0, None)
 
 
 @pytest.mark.extended
