@@ -26,6 +26,8 @@ ENTRIES = 6
 position exceeds a whole one, and the displacement upwards (mm)."""
 LANES = 128
 """Pixels of a program of a plane, and voxels of one of a volume."""
+LANES_PER_WARP = 32
+"""Of a volume: more let a thread share the place in the plane among its slices."""
 
 
 @triton.jit
@@ -178,8 +180,6 @@ def backproject_plane(
     atan: Tensor,
     numbers: Tensor,
     kind: int,
-    *,
-    lanes: int = LANES,
 ) -> None:
     """``data (B, V, columns)`` into ``out (B, Y, X)``, both contiguous.
 
@@ -192,11 +192,10 @@ def backproject_plane(
         numbers: first y from the grid's centre and pitch, the same of x; sod; columns per unit of
             the tangent or of the angle.
         kind: of beam, see :mod:`recon.analytic.backproject_kernels`.
-        lanes: most pixels of a program.
     """
     batch, views, columns = data.shape
     ny, nx = out.shape[1:]
-    block = min(lanes, triton.next_power_of_2(nx))
+    block = min(LANES, triton.next_power_of_2(nx))
     _plane_kernel[(batch * ny, triton.cdiv(nx, block))](
         data,
         out,
@@ -213,7 +212,7 @@ def backproject_plane(
         TERMS=len(atan),
         ENTRIES=ENTRIES,
         BLOCK=block,
-        num_warps=_warps(block),
+        num_warps=_warps(block, 32),
     )
 
 
@@ -225,8 +224,6 @@ def backproject_volume(
     atan: Tensor,
     numbers: Tensor,
     kind: int,
-    *,
-    lanes: int = LANES,
 ) -> None:
     """``data (B, V, rows, columns)`` into ``out (B, Z, Y, X)``.
 
@@ -235,8 +232,8 @@ def backproject_volume(
     """
     batch, views, rows, columns = data.shape
     nz, ny, nx = out.shape[1:]
-    block = min(lanes, 64, triton.next_power_of_2(nz))
-    along = max(1, lanes // block)
+    block = min(LANES, 64, triton.next_power_of_2(nz))
+    along = max(1, LANES // block)
     turned = data.transpose(-1, -2).contiguous()
     volume = torch.empty((batch, ny, nx, nz), dtype=out.dtype, device=out.device)
     step, last = _ends(columns)
@@ -261,7 +258,7 @@ def backproject_volume(
         ENTRIES=ENTRIES,
         ALONG=along,
         BLOCK=block,
-        num_warps=_warps(along * block),
+        num_warps=_warps(along * block, LANES_PER_WARP),
     )
     out.copy_(volume.permute(0, 3, 1, 2))
 
@@ -271,5 +268,5 @@ def _ends(cells: int) -> tuple[int, int]:
     return min(cells - 1, 1), max(cells - 2, 0)
 
 
-def _warps(lanes: int) -> int:
-    return max(1, min(4, lanes // 32))
+def _warps(lanes: int, each: int) -> int:
+    return max(1, min(4, lanes // each))
