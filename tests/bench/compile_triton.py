@@ -20,8 +20,11 @@ from triton.compiler import ASTSource
 
 from recon.analytic import backproject_triton as fbp
 from torchpcct.projector.cuda import kernels as projector
+from torchpcct.projector.cuda import vector_kernels as vectors
 
-POINTERS = {"lines": "*i64"} | dict.fromkeys(("axes", "segments", "buckets", "whole"), "*i32")
+POINTERS = {"lines": "*i64"} | dict.fromkeys(
+    ("axes", "segments", "buckets", "whole", "starts", "entries"), "*i32"
+)
 """Tables of whole numbers."""
 NUMBERS = (
     "images",
@@ -31,16 +34,26 @@ NUMBERS = (
     "depths",
     "numbers",
     "heights",
+    "widths",
+    "projections",
     "tables",
     "table",
     "atan",
 )
 """Arrays of the data's dtype."""
+VECTORS = [
+    {"PLANE": plane, "PARALLEL": parallel, "PARTS": parts, "BLOCK": 128}
+    for plane in (False, True)
+    for parallel in (False, True)
+    for parts in (False, True)
+]
 SHAPES = {
     projector.project_plane: [{"PARALLEL": p, "BLOCK": 128} for p in (False, True)],
     projector.project_cone: [{"BLOCK": 256}],
     projector.backproject_plane: [{"PARALLEL": p, "BLOCK": 128} for p in (False, True)],
     projector.backproject_cone: [{"BLOCK": 256}],
+    vectors.project_vectors: VECTORS,
+    vectors.backproject_vectors: VECTORS,
     fbp._plane_kernel: [{"KIND": k, "TERMS": 7, "ENTRIES": 6, "BLOCK": 128} for k in range(3)],
     fbp._volume_kernel: [
         {"KIND": k, "TERMS": 7, "ENTRIES": 6, "ALONG": 2, "BLOCK": 64} for k in (1, 2)

@@ -18,7 +18,10 @@ from torchpcct.devices import require_triton
 from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, VolumeGrid
 from torchpcct.kernel_cache import announce_compilation
 from torchpcct.projector.cuda import passes as cuda
+from torchpcct.projector.cuda import vector_passes as cuda_vectors
+from torchpcct.projector.cuda.vector_cells import Limits
 from torchpcct.projector.tables import Tables, VectorTables
+from torchpcct.vector_geometry import VectorGeometry
 
 _TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-10}
 """Relative error up to which a device's kernels agree with the CPU's."""
@@ -45,7 +48,7 @@ class Engine:
 
     def __init__(self, tables: Tables | VectorTables) -> None:
         self.tables = tables
-        self._devices: dict[torch.device, cuda.GpuPasses] = {}
+        self._devices: dict[torch.device, cuda.GpuPasses | cuda_vectors.GpuVectorPasses] = {}
         self._enter()
 
     def _enter(self) -> None:
@@ -72,10 +75,15 @@ class Engine:
 
         return PlanePasses(self.tables)
 
-    def on(self, device: torch.device) -> cuda.GpuPasses:
+    def on(self, device: torch.device) -> cuda.GpuPasses | cuda_vectors.GpuVectorPasses:
         """The Triton passes, with their tables on ``device``."""
-        assert isinstance(self.tables, Tables)
-        if device not in self._devices:
+        if device in self._devices:
+            return self._devices[device]
+        if isinstance(self.tables, VectorTables):
+            self._devices[device] = cuda_vectors.GpuVectorPasses(
+                self.tables, device, _vector_limits()
+            )
+        else:
             from torchpcct.projector.cpu.cone_kernels import (
                 MAX_LAYERS_PER_SLAB,
                 NEAREST,
@@ -133,27 +141,25 @@ class Engine:
     def workspace(self, batch: int, itemsize: int, device: str) -> int:
         """Bytes that one pass holds besides its input and output (the larger of the two
         directions)."""
-        if device == "cpu" or isinstance(self.tables, VectorTables):
+        if device == "cpu":
             return self.cpu.workspace(batch, itemsize)
+        if isinstance(self.tables, VectorTables):
+            return cuda_vectors.workspace(self.tables, _vector_limits(), batch, itemsize)
         return cuda.workspace(self.tables, batch, itemsize)
 
-    def _trusted_on(self, device: torch.device, dtype: torch.dtype) -> cuda.GpuPasses:
+    def _trusted_on(
+        self, device: torch.device, dtype: torch.dtype
+    ) -> cuda.GpuPasses | cuda_vectors.GpuVectorPasses:
         """The passes on a device, once they have reproduced the CPU's there.
 
         Raises:
-            ValueError: the scan has none, or Triton is missing. RuntimeError: they compute
-                something else.
+            ValueError: Triton is missing. RuntimeError: they compute something else.
         """
-        if not isinstance(self.tables, Tables):
-            raise ValueError(
-                "a scan given by vectors that no circular scan describes has passes on the CPU "
-                f"only, and the data lie on {device}: move them with .cpu()"
-            )
         require_triton(device, "the projector")
-        kind = type(self.tables.geometry)
-        key = (f"{device} {kind.__name__}", dtype)
+        kind, small = _small_scan(self.tables)
+        key = (f"{device} {kind}", dtype)
         if key not in _CHECKED:
-            _CHECKED[key] = Engine(Tables(*_SMALL[kind])).deviation(device, dtype)
+            _CHECKED[key] = Engine(small).deviation(device, dtype)
         if not _CHECKED[key] <= _TOLERANCE[dtype]:
             raise RuntimeError(
                 f"the Triton projector on {device} differs from the CPU's by {_CHECKED[key]:.1e} "
@@ -193,3 +199,30 @@ _SMALL: dict[type[Geometry], tuple[Geometry, VolumeGrid]] = {
     ),
 }
 """A small scan of each kind of beam."""
+
+
+def _small_scan(tables: Tables | VectorTables) -> tuple[str, Tables | VectorTables]:
+    """Name of a scan's kernels, and the tables of a small scan that takes them."""
+    if isinstance(tables, Tables):
+        kind = type(tables.geometry)
+        return kind.__name__, Tables(*_SMALL[kind])
+    parallel, flat = tables.geometry.parallel, tables.grid.ndim == 2
+    geometry, grid = _SMALL[(ParallelBeam if parallel else FanBeam) if flat else ConeBeam]
+    vectors = VectorGeometry.of(geometry)
+    if flat:
+        turned = vectors.turned(slant=0.2)
+    else:
+        turned = vectors.turned(0.3, -0.2, 0.1)
+        if parallel:
+            rays = vectors.poses[:, 1] - vectors.poses[:, 0]
+            turned = VectorGeometry(
+                np.concatenate([rays, turned.vectors[:, 3:]], 1), turned.columns, turned.rows, True
+            )
+    name = f"VectorGeometry, {'parallel' if parallel else 'point source'}, {grid.ndim}-D"
+    return name, VectorTables(turned, grid)
+
+
+def _vector_limits() -> Limits:
+    from torchpcct.projector.cpu import vector_kernels as cpu
+
+    return Limits(cpu.NEAREST, cpu.POINT, cpu._MOST_PARTS, cpu._SLOPE, cpu._SMALL)

@@ -278,14 +278,14 @@ class Projector(Operator):
     the output (a NaN may also reach readings that share a grid line with it). ``torch.compile``
     and, within the process, ``torch.export`` take a pass as one operation. The module has no
     parameters and no state. Tensors on a GPU take the Triton kernels, after a check against the CPU
-    at their first use; nothing travels to the CPU. They are refused without Triton, where that
-    check fails, and of vectors that no circular scan describes.
+    at their first use; nothing travels to the CPU. They are refused without Triton, and where that
+    check fails.
 
     Args:
         geometry: ``ParallelBeam`` or ``FanBeam`` with a 2-D grid, ``ConeBeam`` with a 3-D grid; or
             a :class:`~torchpcct.vector_geometry.VectorGeometry`: what is a circular scan, at rest
-            or moving (a helix), takes the passes of one, anything else general ones on the CPU,
-            several times slower. Of one with tensors
+            or moving (a helix), takes the passes of one, anything else general ones, several
+            times slower. Of one with tensors
             (:func:`~torchpcct.projector.poses.with_parameters`) readings have gradients by them.
         grid: the voxel grid.
         window: the part of the detector to compute (``torchpcct.detector_window.footprint``), or
