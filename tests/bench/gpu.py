@@ -36,11 +36,21 @@ import torch
 from recon.analytic.backproject import BackprojectionPlan
 from recon.analytic.fbp import fbp
 from recon.api import reconstruct
-from torchpcct import ConeBeam, FanBeam, ParallelBeam, Projector, Scan, VolumeGrid, acquire
+from torchpcct import (
+    ConeBeam,
+    FanBeam,
+    ParallelBeam,
+    Projector,
+    Scan,
+    VectorGeometry,
+    VolumeGrid,
+    acquire,
+)
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import full_turn
 from torchpcct.scanner import presets
 from torchpcct.scene.plaque import plaque_scene
+from torchpcct.vector_geometry import helical_motion
 from train.__main__ import build
 from train.config import LateConfig, load_config
 from train.processes import Group, gradient
@@ -138,6 +148,10 @@ def agreement_cases(tiny: bool) -> dict[str, tuple[Any, VolumeGrid, Any, Any]]:
     near = {"sod": 1.5 * n, "sdd": 3.0 * n, "columns": columns}
     window = DetectorWindow(np.full(views, n // 2), n)
     sway = np.stack([np.cos(turn), np.sin(2 * turn), np.sin(turn)], 1)
+    cone = ConeBeam(turn, rows=rows, pitch=(2.2, 2.2), **near)
+    long = ConeBeam(turn, rows=rows, pitch=(1.1, 9.0), **near)
+    helix = VectorGeometry.of(cone, helical_motion(cone, 0.5 * z, -0.25 * z))
+    slanted = VectorGeometry.of(FanBeam(turn, pitch=2.2, **near)).turned(slant=0.3 * np.cos(turn))
     return {
         "parallel": (ParallelBeam(turn, columns, 1.1, 0.3), plane, None, None),
         "fan": (FanBeam(turn, pitch=2.2, **near), plane, None, None),
@@ -145,8 +159,27 @@ def agreement_cases(tiny: bool) -> dict[str, tuple[Any, VolumeGrid, Any, Any]]:
         "fan, window": (FanBeam(turn, pitch=2.2, **near), plane, window, None),
         "cone": (ConeBeam(turn, rows=rows, pitch=(2.2, 2.2), **near), volume, None, None),
         "cone, layers": (ConeBeam(turn, rows=rows, pitch=(2.2, 2.2), **far), volume, None, None),
-        "cone, moving": (ConeBeam(turn, rows=rows, pitch=(2.2, 2.2), **near), volume, None, sway),
+        "cone, moving": (cone, volume, None, sway),
+        # Detectors that lean: no circular scan describes them.
+        "vectors, helix": (helix.turned(tilt=0.05), volume, None, None),
+        "vectors, rolled long cells": (
+            VectorGeometry.of(long).turned(0.6, 0.2, 0.1),
+            volume,
+            None,
+            None,
+        ),
+        "vectors, parallel": (laminography(turn, rows, columns), volume, None, None),
+        "vectors, plane": (slanted, plane, None, None),
     }
+
+
+def laminography(turn: Any, rows: int, columns: int) -> VectorGeometry:
+    """Parallel rays that leave the plane of rotation by half a rad."""
+    radial = np.stack([np.cos(turn), np.sin(turn), 0 * turn], 1)
+    tangent = np.stack([-np.sin(turn), np.cos(turn), 0 * turn], 1)
+    ray = np.array([0.0, 0.0, math.sin(0.5)]) - math.cos(0.5) * radial
+    vectors = [ray, 0 * ray, 1.1 * tangent, 1.1 * np.cross(tangent, ray)]
+    return VectorGeometry(np.concatenate(vectors, 1), columns, rows, parallel=True)
 
 
 def projector_agreement(bench: Bench, case: Any, dtype: torch.dtype) -> dict[str, Any]:
@@ -222,6 +255,10 @@ def field_scan(kind: str, n: int, views: int) -> tuple[Scan, VolumeGrid]:
     if kind == "fan":
         geometry: Any = FanBeam(turn, 300.0, 600.0, n * 3 // 2, pitch)
         grid = VolumeGrid((n, n), 100.0 / n)
+    elif kind == "vectors":
+        fan = FanBeam(turn, 300.0, 600.0, n * 3 // 2, pitch)
+        geometry = VectorGeometry.of(fan).turned(slant=0.1 * np.cos(turn))
+        grid = VolumeGrid((n, n), 100.0 / n)
     else:
         geometry = ConeBeam(turn, 300.0, 600.0, n * 3 // 2, n // 2, (pitch, pitch))
         grid = VolumeGrid((n // 4, n, n), 100.0 / n)
@@ -236,6 +273,9 @@ def field_scan(kind: str, n: int, views: int) -> tuple[Scan, VolumeGrid]:
 
 
 def timed_cases(tiny: bool) -> dict[str, tuple[Any, VolumeGrid]]:
+    """Geometry and grid; scans given by vectors are timed alone, the peers do not take them
+    here."""
+
     def cone(n: int, views: int, rows: int, columns: int) -> tuple[ConeBeam, VolumeGrid]:
         pitch = 1.5 * 2.0 * n / columns
         beam = ConeBeam(full_turn(views), 3.0 * n, 6.0 * n, columns, rows, (pitch, pitch))
@@ -245,9 +285,11 @@ def timed_cases(tiny: bool) -> dict[str, tuple[Any, VolumeGrid]]:
         fan = FanBeam(full_turn(3), 24.0, 48.0, 10, 2.4), VolumeGrid((8, 8), 1.0)
         return {"fan 8²": fan, "cone 4³": cone(4, 3, 4, 6)}
     fan = FanBeam(full_turn(720), 1536.0, 3072.0, 720, 2.2), VolumeGrid((512, 512), 1.0)
+    leaning, voxels = cone(128, 180, 192, 192)
     return {
         "fan 512², 720 × 720": fan,
         "cone 64³, 90 × 96²": cone(64, 90, 96, 96),
+        "vectors 128³, 180 × 192²": (VectorGeometry.of(leaning).turned(0.02, 0.03), voxels),
         "cone 256³, 360 × 384²": cone(256, 360, 384, 384),
         "cone 512³, 360 × 1024 × 768": cone(512, 360, 768, 1024),
     }
@@ -258,12 +300,11 @@ def operations(bench: Bench, geometry: Any, grid: VolumeGrid) -> dict[str, Calla
     A = Projector(geometry, grid)
     passes = A._engine.on(bench.device)
     x, y = (torch.rand((1, *s), device=bench.device) for s in (A.domain_shape, A.range_shape))
+    made = {"forward": lambda: passes.forward(x), "adjoint": lambda: passes.adjoint(y)}
+    if isinstance(geometry, VectorGeometry):
+        return made
     plan = BackprojectionPlan(geometry, grid, DetectorWindow.full(geometry))
-    return {
-        "forward": lambda: passes.forward(x),
-        "adjoint": lambda: passes.adjoint(y),
-        "backprojection of FBP": lambda: plan._forward_there(y),
-    }
+    return made | {"backprojection of FBP": lambda: plan._forward_there(y)}
 
 
 def diffct(bench: Bench, geometry: Any, grid: VolumeGrid) -> dict[str, Callable[[], Any]]:
@@ -321,7 +362,8 @@ def torchtomo(bench: Bench, geometry: Any, grid: VolumeGrid) -> dict[str, Callab
 def timed(bench: Bench) -> None:
     peers = [p for p in (torchtomo, diffct) if util.find_spec(p.__name__) and not bench.tiny]
     for name, (geometry, grid) in timed_cases(bench.tiny).items():
-        for maker in (operations, *peers):
+        others = [] if isinstance(geometry, VectorGeometry) else peers
+        for maker in (operations, *others):
             toolkit = "torchpcct" if maker is operations else maker.__name__
             made: dict[str, Callable[[], Any]] = {}
 
@@ -542,8 +584,9 @@ def main() -> None:
     about = versions(bench.device)
     print(about, flush=True)
     cases = agreement_cases(tiny)
-    if tiny:  # one of each kernel
-        cases = {name: cases[name] for name in ("parallel", "fan", "cone, layers", "cone")}
+    if tiny:
+        of_each_kernel = "parallel", "fan", "cone, layers", "cone", "vectors, plane"
+        cases = {name: cases[name] for name in of_each_kernel}
     for name, case in cases.items():
         for dtype in BOUNDS:
             kind = str(dtype).removeprefix("torch.")
@@ -552,7 +595,7 @@ def main() -> None:
                 f"{name}, {kind}",
                 lambda c=case, d=dtype: projector_agreement(bench, c, d),
             )
-            if case[2] is None:
+            if case[2] is None and not isinstance(case[0], VectorGeometry):
                 bench.run(
                     "FBP", f"{name}, {kind}", lambda c=case, d=dtype: fbp_agreement(bench, c, d)
                 )
@@ -563,6 +606,13 @@ def main() -> None:
             "chain",
             f"pwls, {name}",
             lambda k=name: chain_agreement(bench, "pwls", k, tolerance=5.0),
+        )
+    bench.run("gradient", "vectors", lambda: gradient_agreement(bench, cases["vectors, plane"]))
+    for method, options in (("fbp", {}), ("pwls", {"tolerance": 5.0})):
+        bench.run(
+            "chain",
+            f"{method}, vectors",
+            lambda m=method, o=options: chain_agreement(bench, m, "vectors", **o),
         )
     bench.run("chain", "mbir, fan", lambda: chain_agreement(bench, "mbir", "fan"))
     bench.run("card", "at best", lambda: bandwidth(bench))

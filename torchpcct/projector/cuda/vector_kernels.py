@@ -231,7 +231,6 @@ def backproject_vectors(
     views,
     rows,
     columns,
-    rounds,
     PLANE: tl.constexpr,
     PARALLEL: tl.constexpr,
     PARTS: tl.constexpr,
@@ -241,7 +240,7 @@ def backproject_vectors(
 
     ``data``: ``(batch, views, rows, columns)``; ``lines, widths, axes, starts``: of the cells from
     view ``begin`` on; ``entries``: ``(count, 2)`` view and axis; ``projections``: ``(count, 20)``,
-    see ``vector_passes``; ``rounds``: parts of a cell at most.
+    see ``vector_passes``.
     """
     number: tl.constexpr = out.dtype.element_ty
     voxel = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -314,10 +313,11 @@ def backproject_vectors(
                 cell = (view - begin) * (rows * columns) + place
                 asked = asked & (tl.load(axes + cell, mask=asked, other=-1) == axis)
                 value = tl.load(given + place, mask=asked, other=0.0)
-                first, own = cell, tl.where(asked, 1, 0)
+                first, own, rounds = cell, tl.where(asked, 1, 0), 1
                 if PARTS:
                     first = tl.load(starts + cell, mask=asked, other=0)
                     own = tl.load(starts + cell + 1, mask=asked, other=0) - first
+                    rounds = tl.max(own)
                 for n in tl.range(0, rounds):
                     live = n < own
                     pa, qa, pb, qb, wa, wb, path, l0, l1 = _part(

@@ -199,7 +199,6 @@ class GpuVectorPasses:
                 cells.views,
                 cells.rows,
                 cells.columns,
-                table.most,
                 PLANE=self.plane,
                 PARALLEL=self.parallel,
                 PARTS=table.most > 1,
