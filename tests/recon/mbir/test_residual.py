@@ -10,7 +10,8 @@ from inset_operators import HU, problem
 
 from recon.data_term import Quadratic
 from recon.gram.gram import Gram
-from recon.mbir.frequencies import filtered
+from recon.mbir import residual
+from recon.mbir.frequencies import filtered, squared_frequencies
 from recon.mbir.residual import MissingBody, missing_body, significant_residual
 
 DAMPING = 0.1
@@ -141,6 +142,12 @@ def test_no_body_is_missing_in_noise(gram):
     assert not any(missed(left(gram, torch.zeros(SHAPE), 1.0, batch=200)))
 
 
+@pytest.mark.parametrize(("deviations", "is_said"), [(5.5, False), (9.5, True)])
+def test_edges_of_vessels_stand_out_by_less(gram, deviations, is_said):
+    (body,) = missed(left(gram, ball() * striking_hu(gram, deviations), 0.0))
+    assert (body is not None) is is_said
+
+
 def test_a_body_that_the_volume_shows_is_not_missing(gram):
     hu = striking_hu(gram, 40.0)
     p = left(gram, ball() * hu, 1.0)
@@ -160,6 +167,32 @@ def test_edges_that_stand_out_of_little_noise_are_not_said(gram, noise_hu, is_sa
     p = Quadratic(gram, b, torch.full((1,), dose), (0.4,) * 3, 1000 * HU).in_noise_units()
     (body,) = missed(p)
     assert (body is not None) is is_said
+
+
+def test_a_body_is_as_large_as_what_is_left_of_its_frequencies_says(gram):
+    """A data consistency has taken low ones away, of noise and ball: the contrast counts them."""
+    hu = striking_hu(gram, 40.0)
+    p = left(gram, ball() * hu, 1.0)
+    f2 = squared_frequencies(SHAPE, 0.4, p.b)
+    kept = f2 / (f2 + 0.3**2)
+    (body,) = missing_body(p, filtered(p.b, kept), kept)
+    assert body is not None
+    assert max(abs(a - b) for a, b in zip(body.voxel, BALL_VOXEL, strict=True)) <= 1
+    assert body.contrast_hu == pytest.approx(hu, rel=0.2)
+    (taken_as_whole,) = missing_body(p, filtered(p.b, kept), torch.tensor(1.0))
+    assert taken_as_whole is None or taken_as_whole.contrast_hu < 0.7 * hu
+
+
+@pytest.mark.parametrize(("times", "louder"), [(0.5, 0.5), (1.35, 1.0), (4.0, 4.0 / 1.5)])
+def test_what_is_left_in_most_places_is_noise(gram, monkeypatch, times, louder):
+    """A prior that sharpens leaves up to half as much again; beyond, it is what is missing."""
+    monkeypatch.setattr(residual, "_STANDS_OUT", 0.0)
+    p = left(gram, torch.zeros(SHAPE), 1.0, batch=20)
+    usual, now = (
+        sum(body.deviations for body in missing_body(p, k * p.b, torch.tensor(1.0)))
+        for k in (1.0, times)
+    )
+    assert now == pytest.approx(louder * usual, rel=0.1)
 
 
 def test_thin_and_small_volumes_are_not_searched():

@@ -49,6 +49,16 @@ def test_angles_that_scatter_are_found_and_measured(beam):
         assert abs(found.sizes["view_scatter"] - 0.4) < 0.15
 
 
+def test_the_size_of_the_scatter_is_as_uncertain_as_is_stated():
+    sizes, stated = [], []
+    for seed in range(12):
+        offsets = 0.4 * np.random.default_rng(seed).standard_normal(360)
+        found = geometry_test(_lines("parallel", seed, photons=3e5), _turned("parallel", offsets))
+        sizes.append(found.sizes["view_scatter"])
+        stated.append(found.errors["view_scatter"])
+    assert 0.55 < np.std(sizes) / np.mean(stated) < 1.6
+
+
 @pytest.mark.parametrize("beam", BEAMS)
 def test_nothing_else_is_taken_for_scatter(beam):
     v = np.arange(360)
