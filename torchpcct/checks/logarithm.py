@@ -60,6 +60,9 @@ _FITS = 3.0
 """χ² over the number of classes up to which it is noise that is looked at."""
 _CLIPPED = 2.5
 """Photons below which readings without any change the noise of logarithms."""
+_BRIGHT = 5.0
+"""Photons in the median class of a group from which its noise tells their signal; in darker ones
+it is that of the groups beside."""
 _BEYOND = (-1.0, -0.5, 0.0, *(float(v) for v in np.geomspace(0.5, 2500.0, 25)))
 """What the variance may be above the photons that are read: less, where one or half of one was
 added, more, where electronics add noise."""
@@ -213,14 +216,14 @@ def _counted(
 def _units(classes: list[tuple[Floats, Floats, Floats]], beyond: float) -> tuple[Floats, float]:
     """The signal of a photon in each group of columns where the variance of ``m`` photons is ``m +
     beyond``, and how badly that fits (χ²)."""
-    units = np.empty(len(classes))
+    units, bright = np.empty(len(classes)), np.zeros(len(classes), dtype=np.bool_)
     for k, (level, variance, _) in enumerate(classes):
         unit = float(np.median(variance / level))
         for _ in range(40):
             x = level / unit
             clear = x > _CLIPPED
             if clear.sum() < 2:
-                clear = x >= np.sort(x)[-2]
+                clear = x >= np.sort(x)[-2:][0]
             model = np.maximum(x + beyond, 0.2 * x)
             # Edges of the object are in some of the classes.
             ratio = float(np.median((variance / model)[clear])) / unit**2
@@ -228,6 +231,10 @@ def _units(classes: list[tuple[Floats, Floats, Floats]], beyond: float) -> tuple
                 break
             unit *= ratio**0.5
         units[k] = unit
+        bright[k] = np.median(level / unit) > _BRIGHT
+    if bright.any():  # single photons, clipped or not, tell little of their signal
+        at = np.arange(len(units))
+        units = np.where(bright, units, np.interp(at, at[bright], units[bright]))
     return units, _misfit(classes, units, beyond)
 
 

@@ -75,11 +75,11 @@ def test_pylops_takes_it(A):
     )
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def deepinv():
-    """It imports torchvision, whose compiled operators (no one is used here) lack beside a PyTorch
-    for CPUs alone, unless torchvision is of https://download.pytorch.org/whl/cpu, too; it then
-    looks for two of them in vain."""
+    """Once, as operators cannot be registered again. It imports torchvision, whose compiled
+    operators (no one is used here) lack beside a PyTorch for CPUs alone, unless torchvision is of
+    https://download.pytorch.org/whl/cpu, too; it then looks for two of them in vain."""
     if importlib.util.find_spec("deepinv") is None:
         pytest.skip("deepinv is not installed")
     if torch.version.cuda is None and "+cpu" not in importlib.metadata.version("torchvision"):
