@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic import Ellipsoid, line_integrals
-from sound_scans import BALL, BOX, CYLINDER, Solid, draw, transmissions
+from sound_scans import BALL, BOX, CYLINDER, Solid, draw, possible, transmissions
 
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, full_turn
 from torchpcct.checks.conjugate_rays import geometry_test
@@ -31,6 +31,8 @@ ONCE_ALARMED = [
     (70_246, 60_000),
     (70_447, 60_000),
     (79_127, 60_000),
+    (150_230, 50_000),
+    (900_185, 50_000),
 ]
 
 
@@ -57,6 +59,22 @@ def test_wrong_descriptions_are_measured(kind, seed, cause, size):
     assert found.findings, drawn.text
     # ± is two of them
     assert abs(found.sizes[cause] - size) < 3.0 * found.errors[cause] < abs(size)
+
+
+def test_a_hole_takes_away_no_more_than_is_there():
+    """What attenuates less than air would rightly be named."""
+    outer = Solid(BALL, (1.0, 2.0, 0.0), (20.0, 18.0, 15.0), 0.02)
+    hole = Solid(CYLINDER, (3.0, 0.0, 0.0), (5.0, 4.0, 6.0), -0.015, 0.3)
+    again = Solid(BOX, (5.0, 0.0, 0.0), (3.0, 4.0, 2.0), -0.012)
+    beyond = Solid(BALL, (20.0, 2.0, 0.0), (5.0, 5.0, 5.0), -0.01)
+    more = Solid(BALL, (20.0, 2.0, 0.0), (5.0, 5.0, 5.0), 0.01)
+    solids = [outer, hole, again, beyond, more]
+    values = [s.value for s in possible(solids, np.random.default_rng(0))]
+    assert values == pytest.approx([0.02, -0.015, -0.005, 0.0, 0.01])
+    for seed in (130_195, 140_040):
+        drawn = draw(seed, readings=25_000)
+        shone = transmissions(drawn.geometry, drawn.solids, **drawn.options)
+        assert shone.max() <= 1.0 + 1e-12
 
 
 def test_all_parts_of_a_focal_spot_shine():

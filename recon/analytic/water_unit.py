@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import minimum_filter
+from scipy.ndimage import binary_erosion, binary_fill_holes, minimum_filter
 from torch import Tensor
 
 from recon.analytic.angular_weights import angular_weights
@@ -42,6 +42,13 @@ are seen, in shells, nor in several small bodies apart."""
 _DENSE = 0.02
 """Share of the object's attenuation that may lie in what is half as dense as ``mu_water`` says or
 more. The walls of a hollow object are."""
+_WALL = 0.28
+"""Share of the attenuation that may lie in a denser wall about the object: 0.23 in a skull of 6 mm;
+walls of plastic about foam, smeared by the cells, hold more."""
+_WALL_VOXELS = 4
+"""How far such a wall reaches into the object, in voxels."""
+_DENSER = 1.3
+"""Times the plateau from which something is denser."""
 _REACH = 5
 """Width, in voxels, over which a plateau has no border, so that no thin wall is one that the cells
 have smeared."""
@@ -134,9 +141,19 @@ def _plateau(p: Tensor, geometry: Geometry, mu_water: float, factor: float) -> f
     soft = density[solid & (density > low) & (density < high)]
     if not soft.sum() > _SOLID * total:
         return None
-    if factor > 1.0 and density[density > 0.5].sum() > _DENSE * total:
-        return None
-    return float(np.median(soft))
+    plateau = float(np.median(soft))
+    if factor > 1.0:
+        walls = density[_rim(density > 0.5 * plateau) & (density > _DENSER * plateau)]
+        if density[density > 0.5].sum() > _DENSE * total or walls.sum() > _WALL * total:
+            return None
+    return plateau
+
+
+def _rim(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The border of an object, ``_WALL_VOXELS`` wide: holes have none."""
+    filled = binary_fill_holes(inside)
+    rim: NDArray[np.bool_] = filled & ~binary_erosion(filled, iterations=_WALL_VOXELS)
+    return rim
 
 
 def row_image(p: Tensor, geometry: Any) -> NDArray[np.float64] | None:

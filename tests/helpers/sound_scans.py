@@ -388,19 +388,14 @@ def _object(rng: Any, fov: float, height: float, mu: float) -> tuple[str, list[S
     elif name == "tall":  # beyond the rows, above and below
         a = fov * rng.uniform(0.3, 0.9)
         x, y = placed(a)
+        middle = z(height / 2)
+        radii = (a, a * rng.uniform(0.6, 1), height * rng.uniform(1.5, 6))
+        up, value = rng.uniform(-1, 1) * height, mu * rng.uniform(-1, 1)
+        # A hole stays within.
+        c = a / 3 if value > 0.0 else min(a / 3, 0.3 * radii[2])
         bodies = [
-            Solid(
-                BALL,
-                (x, y, z(height / 2)),
-                (a, a * rng.uniform(0.6, 1), height * rng.uniform(1.5, 6)),
-                mu,
-            ),
-            Solid(
-                BALL,
-                (x, y, rng.uniform(-1, 1) * height),
-                (a / 3, a / 3, a / 3),
-                mu * rng.uniform(-1, 1),
-            ),
+            Solid(BALL, (x, y, middle), radii, mu),
+            Solid(BALL, (x, y, up), (a / 3, a / 3, c), value),
         ]
     elif name == "tooth":
         a, c = fov * rng.uniform(0.3, 0.7), height * rng.uniform(0.6, 1.0)
@@ -442,6 +437,35 @@ def _object(rng: Any, fov: float, height: float, mu: float) -> tuple[str, list[S
         ]
     upright = ("round", "off-centre", "ellipse", "several", "shell", "box")
     return f"{name}, endless" if endless and not plane and name in upright else name, bodies
+
+
+def _within(solid: Solid, points: Floats) -> NDArray[np.bool_]:
+    """Which of some points ``(n, 3)`` in mm lie in a body."""
+    matrix = np.array(solid.numbers[5:]).reshape(3, 3)
+    x, y, z = ((points - np.array(solid.center)) @ matrix.T).T
+    if solid.shape == BALL:
+        inside: NDArray[np.bool_] = x * x + y * y + z * z <= 1.0
+    elif solid.shape == CYLINDER:
+        inside = (x * x + y * y <= 1.0) & (np.abs(z) <= 1.0)
+    else:
+        inside = np.maximum(np.maximum(np.abs(x), np.abs(y)), np.abs(z)) <= 1.0
+    return inside
+
+
+def possible(solids: list[Solid], rng: Any, points: int = 4000) -> list[Solid]:
+    """The bodies, none of which takes away more than those before it have where it is, as found at
+    points drawn at random: nothing attenuates less than air."""
+    kept: list[Solid] = []
+    for solid in solids:
+        if solid.value < 0.0:
+            matrix = np.array(solid.numbers[5:]).reshape(3, 3)
+            cube = rng.uniform(-1.0, 1.0, (points, 3))
+            at = cube @ np.linalg.inv(matrix).T + np.array(solid.center)
+            at = at[_within(solid, at)]
+            there = sum((s.value * _within(s, at) for s in kept), np.zeros(len(at)))
+            solid = replace(solid, value=max(solid.value, -float(there.min(initial=math.inf))))
+        kept.append(solid)
+    return kept
 
 
 # --- how it is scanned ----------------------------------------------------------------------------
@@ -569,6 +593,7 @@ def draw(seed: int, *, kind: str | None = None, readings: int = 600_000) -> Draw
         "micro": rng.uniform(0.02, 0.3),
     }[scale]
     name, solids = _object(rng, fov * (rng.uniform(1.2, 1.6) if cut else 1.0), height, water)
+    solids = possible(solids, np.random.default_rng([seed, 5]))
     if cut:
         rightly += [
             "the rows end inside the object",
@@ -596,6 +621,12 @@ def draw(seed: int, *, kind: str | None = None, readings: int = 600_000) -> Draw
         water /= density
         if density > 1.0:
             rightly.append("more than any tissue")
+    if name.startswith("shell") and solids[0].value:
+        filling = 1.0 + solids[1].value / solids[0].value
+        inner = solids[1].radii[0] / solids[0].radii[0]
+        wall = (1.0 - inner**2) / (1.0 - inner**2 + inner**2 * filling)
+        if 0.05 < filling < 0.2 and wall < 0.3:  # the same within a skin
+            rightly.append("is mu_water given in cm⁻¹?")
     # Thin bodies take many rays: those that miss them between two others would be another object's.
     thin = min((s.radii[2] for s in solids if s.value), default=math.inf)
     # Where a flat ball ends, the chords of two rays of a row begin so many columns apart.

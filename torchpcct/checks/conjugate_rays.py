@@ -19,7 +19,9 @@ and each error of the description has its own a and e:
 r is regressed on each pattern. The slopes of the two rays have independent noise, so the product of
 one's, smoothed, and the other's, raw, neither shrinks nor stretches the estimate (instrumental
 variables, Durbin 1954, Rev. Int. Stat. Inst. 22:23). Its error is that of the sums over blocks of
-views, which knows nothing of how noisy a reading is: the test statistic is Student's. The cause
+views, which knows nothing of how noisy a reading is: the test statistic is Student's. What all
+views have alike, as the noise of the air frames, scatters from column to column only; of an object
+that is round about the axis that is most of the error (:meth:`RayPairs.shared_error`). The cause
 that explains most of r is named. Where none does, the share of r in what changes from view to view
 says whether the rays have anything in common; products of neighbouring columns are free of noise.
 
@@ -352,11 +354,22 @@ def _centre(pairs: RayPairs, false_alarms: float) -> tuple[ScanTest, float]:
             score, power, bent, *waves = _blocks(np.stack([*sums, *turning]), pairs.used(columns))
             if power.sum() > 0:
                 design = np.stack([power, *waves], 1)
-                test = _tested(
-                    score, bent, design, false_alarms / len(_COLUMNS), pairs.aligned("centre")
+                size = float(score.sum() / power.sum())
+                stray = _Stray(
+                    pairs.aligned("centre"), pairs.shared_error(pairs.shifted(), columns, size)
                 )
+                test = _tested(score, bent, design, false_alarms / len(_COLUMNS), stray)
                 found.append((test, test.sizes["centre"] ** 2 * float(power.sum())))
     return next((f for f in found if f[0].findings), found[0] if found else (UNKNOWN, 0.0))
+
+
+@dataclass(frozen=True)
+class _Stray:
+    """What is no error of the description and may look like one: squared difference of rays that
+    part or are blurred, and the standard error of the scores by what all views share."""
+
+    parted: float
+    shared: float
 
 
 @dataclass(frozen=True)
@@ -408,7 +421,7 @@ def _student(statistic: float, freedom: float) -> float:
     return float(special.stdtr(freedom, -statistic))
 
 
-def _fitted(score: Floats, power: Floats, bent: Floats, tolerance: float, parted: float) -> _Fit:
+def _fitted(score: Floats, power: Floats, bent: Floats, tolerance: float, stray: _Stray) -> _Fit:
     """Regression of the blocks' scores on their powers, and Student's test of a size beyond the
     tolerance.
 
@@ -418,20 +431,24 @@ def _fitted(score: Floats, power: Floats, bent: Floats, tolerance: float, parted
 
     Args:
         bent: part of the scores that second order has taken off; half of it may be left.
-        parted: squared difference that may look like the cause and is none.
+        stray: what may look like the cause and is none.
     """
     from scipy import special  # loads with its first use
 
     total = float(power.sum())
     size, share = float(score.sum()) / total, power / total
     left = (score - size * power) / (total * np.maximum(np.abs(1.0 - share), 1e-3))
-    noise = max(float(np.sqrt(np.square(left).sum())), float(np.finfo(np.float64).tiny))
+    noise = max(
+        float(np.sqrt(np.square(left).sum())),
+        stray.shared / total,
+        float(np.finfo(np.float64).tiny),
+    )
     freedom = 1.0 / float(np.square(share).sum()) - 1.0
-    stray = 0.5 * abs(float(bent.sum())) / total + math.sqrt(parted / total)
-    beyond = abs(size) - tolerance - stray
+    unknown = 0.5 * abs(float(bent.sum())) / total + math.sqrt(stray.parted / total)
+    beyond = abs(size) - tolerance - unknown
     p_value = 2.0 * _student(beyond / noise, freedom) if freedom > 0 and beyond > 0 else 1.0
     usual = float(special.stdtrit(max(freedom, 1.0), 0.975) / special.ndtri(0.975))
-    error = math.sqrt((usual * noise) ** 2 + (stray / 2.0) ** 2 + (_KNOWN * tolerance) ** 2)
+    error = math.sqrt((usual * noise) ** 2 + (unknown / 2.0) ** 2 + (_KNOWN * tolerance) ** 2)
     return _Fit(size, error, min(p_value, 1.0), size**2 * total)
 
 
@@ -439,10 +456,13 @@ def _fit(pairs: RayPairs, name: str, columns: int, tolerance: float) -> _Fit | N
     """The size of one cause, by slopes over so many columns."""
     pattern = pairs.pattern(name)
     sums = None if pattern is None else pairs.sums(pattern, columns)
-    if sums is None:
+    if pattern is None or sums is None:
         return None
     score, power, bent = _blocks(np.stack(sums), pairs.used(columns))
-    return _fitted(score, power, bent, tolerance, pairs.aligned(name)) if power.sum() > 0 else None
+    if power.sum() <= 0:
+        return None
+    shared = pairs.shared_error(pattern, columns, float(score.sum() / power.sum()))
+    return _fitted(score, power, bent, tolerance, _Stray(pairs.aligned(name), shared))
 
 
 def _fits(pairs: RayPairs, name: str, tolerance: float) -> list[_Fit]:
@@ -492,12 +512,13 @@ def _mismatch(pairs: RayPairs, false_alarms: float) -> tuple[float, int]:
 
 
 def _tested(
-    score: Floats, bent: Floats, design: Floats, false_alarms: float, parted: float
+    score: Floats, bent: Floats, design: Floats, false_alarms: float, stray: _Stray
 ) -> ScanTest:
     power = design[:, 0]
-    fit = _fitted(score, power, bent, CENTRE_TOLERANCE, parted)
+    fit = _fitted(score, power, bent, CENTRE_TOLERANCE, stray)
     # A wave has half the square of its amplitude.
-    swing, swinging = _swing(score, bent, design, math.sqrt(2.0 * parted / float(power.sum())))
+    amplitude = math.sqrt(2.0 * stray.parted / float(power.sum()))
+    swing, swinging = _swing(score, bent, design, amplitude)
     findings = []
     if fit.exceeds(false_alarms / 2):
         findings.append(_centre_text(fit.size, 2.0 * fit.error))

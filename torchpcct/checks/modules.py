@@ -44,6 +44,17 @@ _SLOPE_COLUMNS = 5
 """Columns over which slopes are smoothed."""
 _EVEN = 8.0
 """Effective number of blocks of views that a displacement must be seen in."""
+_PARTED = 0.01
+"""Share of the squared difference by which rays may part that may look like a block: 0.002 of sound
+scans of two rows in which one was seen."""
+_BENDS = 6
+"""Degree of the polynomial over the columns that they look like as well."""
+_SQUARE = 0.9
+"""Part of what a block explains that this polynomial explains at most: 0.97 and more of 26 such
+scans, 0.65 to 0.86 of displaced modules."""
+_SEEN = 2.5
+"""Effective number of columns that a displacement must be seen in: edges are blurred one by one,
+over the width of coarse cells, and a module has :data:`_LEAST`."""
 _LEAST = 4
 """Columns of the narrowest module, and the fewest beside it."""
 _MOST = 128
@@ -74,7 +85,7 @@ def module_test(pairs: RayPairs) -> ScanTest:
     sigmas = abs(size) / error
     findings = []
     sure = sigmas > _SIGMAS and abs(size) > MODULE_TOLERANCE + _SURE * error
-    if sure and _is_block(score, power, begin, end):
+    if sure and _is_block(score, power, begin, end, _PARTED * pairs.parted):
         g = pairs.rays.geometry
         low, high = first + group * begin, min(first + group * end, g.columns) - 1
         mirrored = round(-2.0 * float(g.column_positions[0]) / g.column_pitch)
@@ -151,20 +162,37 @@ def _block(score: Floats, power: Floats) -> tuple[tuple[int, int], _Part, _Part]
     return (int(begin[best]), int(end[best])), parts[0], parts[1]
 
 
-def _is_block(score: Floats, power: Floats, begin: int, end: int) -> bool:
-    """Whether a block explains more of the squared difference than a parabola over the columns,
-    which errors of the centre, of the fan angles and of the orbit look like."""
+def _is_block(score: Floats, power: Floats, begin: int, end: int, parted: float) -> bool:
+    """Whether what a block explains is seen in several of its columns, and is more of the squared
+    difference than a parabola over the columns does, which errors of the centre, of the fan angles
+    and of the orbit look like; and where rays that part along z may be what it explains, more than
+    a polynomial that bends as often as they make it.
+
+    Args:
+        score, power: ``(blocks, groups)``.
+        begin, end: groups of the block.
+        parted: squared difference that rays may part by where they look like a block.
+    """
     a, b = score.sum(0), np.maximum(power.sum(0), 0.0)
     at = np.arange(a.size)
     x = np.linspace(-1.0, 1.0, a.size)
     inside = ((at >= begin) & (at < end)).astype(np.float64)
-    explained = []
-    for model in ((x**0, inside), (x**0, x, x**2)):
+
+    def explained(*model: Floats) -> float:
         design = np.stack(model, 1)
         product = design.T @ a
         normal = design.T @ (b[:, None] * design)
-        explained.append(float(product @ np.linalg.pinv(normal, hermitian=True) @ product))
-    return explained[0] > explained[1]
+        return float(product @ np.linalg.pinv(normal, hermitian=True) @ product)
+
+    within = b[begin:end]
+    if within.sum() ** 2 < _SEEN * np.square(within).sum():
+        return False
+    block = explained(x**0, inside)
+    if block <= explained(x**0, x, x**2):
+        return False
+    constant = explained(x**0)
+    smooth = explained(*(x**k for k in range(_BENDS + 1)))
+    return block - constant > parted or smooth - constant < _SQUARE * (block - constant)
 
 
 def _text(low: int, high: int, mirrored: int, middle: bool, size: float, error: float) -> str:

@@ -55,6 +55,9 @@ _SIGMAS = 4.0
 _LACKING = 0.25
 """Of what cells lack at the ends of the object at most, how much may change with the direction
 besides."""
+_FEIGNED = 0.5
+"""Of the wrong steps that cells feign which lack the most they can at the ends of the object, how
+many may be: 0.45 of 150 boxes drawn at random, without noise, 1 to 6 in line integrals."""
 _LARGEST_STEP = 0.2
 """Relative error of the steps beyond which nothing is linear."""
 _DIRECTIONS = 24
@@ -115,6 +118,9 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     moments = [(p * width * (t / scale) ** k).sum(1) for k in range(3)]
     weight, weight_error = _weight(theta, moments[0])
     step, step_error, amplified = _step(theta, moments[1:])
+    lack[:, 1:-1] += lack_of_cells(p[:, 2:] - p[:, :-2])
+    # Where faces lie along the rays, whole rows of cells lack: waves that turn with no object.
+    blurred = _step(theta, [(lack * width * (t / scale) ** k).sum(1) + moments[k] for k in (1, 2)])
     cell = float(np.median(np.abs(width)))
     mass = float(moments[0].mean())
     centre, centre_error = (
@@ -128,8 +134,9 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     if g.has_rows:
         parted *= min(2.0 * edge / g.sod, 1.0)
     findings = []
-    lacks = turned + _edges(theta, p, lack, p.sum(1))
-    if _LARGEST_STEP > abs(step) > STEP_TOLERANCE + turned * amplified + _SIGMAS * step_error:
+    lacks = turned + _edges(theta, lack, p.sum(1))
+    stray = turned * amplified + _FEIGNED * abs(blurred[0] - step)
+    if _LARGEST_STEP > abs(step) > STEP_TOLERANCE + stray + _SIGMAS * step_error:
         findings.append(
             "the centre of mass and the width of the views do not turn with them: the steps "
             f"between the views are described about {100 * abs(step):.2g} ± {100 * step_error:.1g} "
@@ -209,17 +216,16 @@ def _fit(design: Floats, y: Floats) -> tuple[Floats, Floats]:
     return np.asarray(found, np.float64), np.sqrt(np.maximum(spread, 0.0))
 
 
-def _edges(theta: Floats, p: Floats, lacking: Floats, sums: Floats) -> float:
+def _edges(theta: Floats, lack: Floats, sums: Floats) -> float:
     """Relative change of the sum with the direction that cells may cause in which the object ends.
 
     Args:
         theta, sums: directions, and the sum of each.
-        p: readings sorted into parallel ones ``(directions, columns)``.
-        lacking: what they lack for the object's ends along the rows' axis, the same shape.
+        lack: what readings sorted into parallel ones may lack there, ``(directions, columns)``.
     """
     if sums.mean() <= 0:
         return 0.0
-    most = (lack_of_cells(p[:, 2:] - p[:, :-2]) + lacking[:, 1:-1]).sum(1)
+    most = lack[:, 1:-1].sum(1)
     return _weight(theta, most + sums.mean())[0] + _LACKING * float(most.mean() / sums.mean())
 
 

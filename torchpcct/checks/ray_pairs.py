@@ -22,6 +22,7 @@ from torchpcct.checks.orbit_plane import PARTED, orbit_plane, shared_square
 from torchpcct.checks.scan_test import check_lines
 from torchpcct.detector_window import DetectorWindow
 from torchpcct.geometry import ConeBeam, Geometry, view_step
+from torchpcct.readings import quartile_sd, second_differences
 
 BLOCKS = 24
 """Parts of the views whose scatter tells the error of a sum."""
@@ -40,6 +41,11 @@ _ALIGNED = {"centre": 0.05, "step": 0.06, "scale": 0.25, "roll": 0.05}
 """Share of the squared difference by which rays may part that looks like a cause at most: of 300
 sound cone beams drawn at random, without noise, 0.021, 0.026, 0.056 and 0.009 (of two plates 0.13
 and 0.61, as fan angles by more than a third)."""
+_INTERPOLATED = 12.0 / 7.0
+"""Variance of a sum of differences of conjugate rays over many columns, over what their second
+differences show: where conjugates lie half way between two columns, neighbours share a reading."""
+_FEWEST_BENDS = 8
+"""Second differences from which their quartiles tell how noisy they are."""
 
 Floats = NDArray[np.float64]
 Pattern = tuple[Tensor, str]
@@ -175,6 +181,37 @@ class RayPairs:
             torch.where(known, v, 0.0).sum((1, 2), dtype=torch.float64).numpy() for v in values
         )
         return score, power, bent
+
+    def shared_error(self, pattern: Pattern, columns: int, size: float) -> float:
+        """Standard error of the sum of a pattern's scores by what each column has in all views
+        alike: noise of the air frames, or gains.
+
+        The scatter of views shows nothing of it; that from column to column of the mean over the
+        views does, all that noise leaves of it included. Along the angles the slopes of a turn add
+        up to nothing: 0.
+
+        Args:
+            pattern, columns: see :meth:`sums`.
+            size: of the pattern, which is taken off.
+        """
+        factor, along = pattern
+        if along != "columns":
+            return 0.0
+        smooth, _, known = self.slopes(along, columns)
+        slope = factor * (smooth[0] + smooth[1]) / 2
+        # Wide slopes are known of few columns, what they are taken off is of more.
+        left = self.residue + size * slope
+        left = torch.where(self.known, left, 0.0).sum(0, dtype=torch.float64)
+        number = self.known.sum(0)
+        bend, _ = second_differences((left / number.clamp_min(1)).numpy())
+        there = (number[:, 2:] > 0) & (number[:, 1:-1] > 0) & (number[:, :-2] > 0)
+        bend = bend[there.numpy()]
+        if not bend.size:
+            return 0.0
+        few = bend.size < _FEWEST_BENDS
+        sd = math.sqrt(float(np.square(bend).mean())) if few else quartile_sd(bend)
+        total = torch.where(known, slope, 0.0).sum(0, dtype=torch.float64)
+        return sd * math.sqrt(_INTERPOLATED * float(total.square().sum()) / 6.0)
 
     @cached_property
     def between_views(self) -> Tensor:

@@ -48,6 +48,8 @@ SPARSE = {
     "shell": [disc(100.0), disc(95.0, -1.0)],
     "shell of half a cell": [disc(100.0), disc(99.3, -1.0)],
     "filled shell": [disc(100.0), disc(80.0, -0.87)],
+    "filled shell of a cell": [disc(100.0), disc(94.0, -0.88)],
+    "filled oval of a cell": [disc(100.0, other=80.0), disc(94.0, -0.9, other=75.0)],
     "tablets": [
         disc(5.0, 1.0, (80.0 * math.cos(a), 80.0 * math.sin(a))) for a in np.arange(12) / 2
     ],

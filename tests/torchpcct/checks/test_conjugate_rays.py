@@ -337,3 +337,24 @@ def test_a_round_wall_in_coarse_columns_is_no_disorder():
     drawn = draw(120243, readings=60_000)
     assert drawn.text.startswith("parallel body shell; 958 views")
     assert geometry_test(drawn.scan().line_integrals(), drawn.geometry).findings == ()
+
+
+def test_what_all_views_share_is_no_wrong_centre():
+    """Air of few photons: its noise is in every view alike, so that their scatter tells nothing of
+    it, and of a body round about the axis the centre is known by nothing else."""
+    g = FanBeam(full_turn(115), 120.0, 300.0, 68, 0.5, 0.0, "curved")
+    shone = transmissions(g, [Solid(CYLINDER, (0.0, 0.0, 0.0), (5.5, 5.5, 1e5), 0.0055)])
+    rng = np.random.default_rng(5)
+    sigmas, findings = [], 0
+    for _ in range(40):
+        air = rng.poisson(870.0, (17, g.columns)).mean(0)
+        lines = torch.from_numpy(-np.log(rng.poisson(870.0 * shone) / air))
+        found = centre_test(lines, g)
+        findings += len(found.findings)
+        if "centre" in found.sizes:
+            sigmas.append(found.sizes["centre"] / found.errors["centre"])
+    assert findings == 0
+    assert 0.5 < np.std(sigmas) < 1.3
+    # A centre that is farther off than that is named.
+    known = torch.from_numpy(-np.log(rng.poisson(1e5 * shone) / 1e5))
+    assert "rotation centre" in centre_test(known, _moved(g, 1.0)).findings[0]

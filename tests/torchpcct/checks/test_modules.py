@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 import torch
 from analytic import Ellipsoid, line_integrals
+from sound_scans import BALL, Solid, transmissions
 
 from recon import reconstruct
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, full_turn
 from torchpcct.checks.conjugate_rays import geometry_test
+from torchpcct.checks.modules import module_test
+from torchpcct.checks.ray_pairs import RayPairs
 
 MU = 0.02
 BODIES = [
@@ -90,6 +93,25 @@ def test_sound_scans_and_other_faults_show_no_module(beam):
     assert not any("module" in text for text in _tested(counts, turned).findings)
     if beam != "parallel":
         assert not any("module" in text for text in _tested(counts, g.scaled(1.04)).findings)
+
+
+@pytest.mark.parametrize("height", [0.8, 6.8])
+def test_rays_of_a_short_scan_that_part_along_z_show_no_module(height):
+    """A body that ends beyond two rows: in the third of the turn that has conjugate rays they pass
+    it at other heights, in the middle of its shadow the other way than at its border."""
+    turn = -0.27314 + 0.033841 * np.arange(115)
+    g = ConeBeam(turn, 134.542, 294.512, 193, 2, (1.45983, 0.954142), (0.0, 0.23854))
+    bodies = [
+        Solid(BALL, (-12.87, 5.558, 0.0), (20.425, 18.279, 1.653), 0.04334),
+        Solid(BALL, (-12.87, 5.558, 0.277), (6.808, 6.808, height), -0.04279),
+    ]
+    shone = transmissions(g, bodies, subs=(3, 16, 1))
+    lines = torch.from_numpy(-np.log(np.random.default_rng(1).poisson(7500.0 * shone) / 7500.0))
+    pairs = RayPairs.of(lines, g, None, (0.0, 0.0))
+    assert module_test(pairs).findings == ()
+    pairs.parted = 0.0
+    assert module_test(pairs).findings  # but for what rays part by
+    assert not any("a module" in text for text in geometry_test(lines, g).findings)
 
 
 def test_what_is_round_about_the_axis_shows_nothing():
