@@ -278,6 +278,8 @@ def counted(
     cells = _shapes("readings", raw, geometry)
     bright, bright_frames = _frame("air", air, cells)
     black, black_frames = _frame("dark", dark, cells)
+    if not float((bright - black).nanmedian()) > 0:
+        raise ValueError("air is not brighter than dark: are the two exchanged?")
     signal = raw - _views(black, geometry)
     gain, source = _gain(gain, signal, bright - black, bright_frames, black, geometry)
     if electronic_noise is None:
@@ -286,8 +288,6 @@ def counted(
     number("electronic_noise", electronic_noise, low=0.0)
     offset = bool((black != 0).any())
     counts, bright = signal / gain, (bright - black) / gain
-    if not float(bright.nanmedian()) > 0:
-        raise ValueError("air is not brighter than dark: are the two exchanged?")
     mask = _dead(dead, counts, bright, geometry)
     counts = counts.masked_fill(mask, 0.0)
     bright = torch.where((bright > 0) & torch.isfinite(bright), bright, 1.0)

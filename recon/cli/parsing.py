@@ -609,7 +609,7 @@ def without_ending(path: Path) -> str:
     name = path.resolve().name
     return (
         name[: -len(".nii.gz")]
-        if name.endswith(".nii.gz")
+        if name.lower().endswith(".nii.gz")
         else name
         if path.is_dir()
         else Path(name).stem

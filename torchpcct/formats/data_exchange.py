@@ -43,6 +43,8 @@ _PIXEL = (
 """Where Data Exchange files keep the size of a pixel, the first that is there."""
 _HALF_TURNS = 4
 """Angles without a unit that end within a step of so many half turns, or fewer, are in rad."""
+_LARGEST_UNNAMED_MM = 10.0
+"""Largest pixel whose size has no unit: it is in m as the format says, or nobody knows in what."""
 _LARGEST_RAD = 7.0
 """Ranges of angles without a unit that may be either, if they are no half turns: beyond it they
 are degrees."""
@@ -278,9 +280,12 @@ def angles_in(data: h5py.Dataset, views: int, what: str, of: slice | Bools = sli
 def length_in(data: h5py.Dataset) -> tuple[float | None, str]:
     """A length in mm of a data set of one number, None if it has no known unit or is none; and
     what it says."""
-    unit = unit_text(data.attrs.get("units", "m"))
+    written = "units" in data.attrs
+    unit = unit_text(data.attrs["units"]) if written else "m"
     value = float(np.ravel(data[()])[0])
     known = unit in MM and math.isfinite(value) and value > 0
+    if not written and known and value * MM[unit] > _LARGEST_UNNAMED_MM:
+        return None, f"the file's pixel size is {value:g} without a unit, no size in m"
     return value * MM[unit] if known else None, f"the file's pixel size is {value:g} {unit}"
 
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 MM = {
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1e3),
     **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 10.0),
+    **dict.fromkeys(("dm", "decimeter", "decimeters", "decimetre", "decimetres"), 100.0),
     **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1.0),
     **dict.fromkeys(
         (
@@ -30,6 +31,8 @@ MM = {
         1e-3,
     ),
     **dict.fromkeys(("nm", "nanometer", "nanometers", "nanometre", "nanometres"), 1e-6),
+    **dict.fromkeys(("å", "angstrom", "angstroms"), 1e-7),
+    **dict.fromkeys(("in", "inch", "inches"), 25.4),
 }
 """Millimetres of a unit, by its name in small letters."""
 

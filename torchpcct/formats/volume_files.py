@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import gzip
 import io
+import itertools
 import json
 import math
 import os
 import re
 import shutil
+import warnings
 import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -59,6 +61,9 @@ _MADE_BY = "torchpcct, "
 _MM = {0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3}
 """Millimetres of NIfTI's units of length: unknown (in practice mm), metre, millimetre,
 micrometre."""
+_SAME_PLACE = 0.1
+"""Part of a voxel by which sform and qform may differ: they are kept in float32, as a rotation in
+the one, as a matrix in the other."""
 _AFTER_VOXELS = 2**20
 """Bytes that may stand behind the voxels of a packed NIfTI."""
 
@@ -122,7 +127,7 @@ def check_target(path: str | os.PathLike[str], voxels: int = 0, unit: str = "HU"
     if form == "OME-Zarr":
         needed("zarr")
     require_writable(target.parent)
-    compressed = form in ("MetaImage", "OME-Zarr") or target.suffix == ".gz"
+    compressed = form in ("MetaImage", "OME-Zarr") or target.suffix.lower() == ".gz"
     least = 0 if compressed else voxels * (2 if form == "DICOM" else 4)
     free = shutil.disk_usage(target.parent).free
     if least > free:
@@ -152,7 +157,7 @@ def is_own_volume(path: str | os.PathLike[str]) -> bool:
             return False
     try:
         require_ordinary(path)
-        with gzip.open(path) if str(path).endswith(".gz") else open(path, "rb") as file:
+        with gzip.open(path) if _is_packed(path) else open(path, "rb") as file:
             header = file.read(2**12)
     except (OSError, EOFError, ValueError, zlib.error):
         return False
@@ -183,7 +188,7 @@ def write_nifti(path: str | os.PathLike[str], data: ArrayLike, grid: VolumeGrid,
         np.asarray(data, dtype=np.float32).transpose(2, 1, 0), None, nifti_header(grid, unit)
     )
     with atomic_write(path) as part, part.open("wb") as raw:
-        if not str(path).endswith(".gz"):
+        if not _is_packed(path):
             image.to_stream(raw)
         else:
             # the same for the same
@@ -228,11 +233,13 @@ def read_nifti(
     import nibabel
 
     with reading(path, "NIfTI"):
-        packed = str(path).lower().endswith(".gz")
-        if packed:
+        if _is_packed(path):
             _check_packed(path)
-        # By what it holds, not by an ending in capitals.
-        image: Any = nibabel.load(path)
+        with gzip.open(path) if _is_packed(path) else open(path, "rb") as file:
+            kind_of = _image_kind(file.read(4))
+        # By what it holds: nibabel looks for another file where an ending is partly in capitals.
+        holder = nibabel.fileholders.FileHolder(filename=str(path))
+        image: Any = kind_of.from_file_map({"image": holder, "header": holder})
         shape, kind = tuple(image.shape), image.header.get_data_dtype()
         check_expansion(shape, "the volume", os.stat(path).st_size, max(4, kind.itemsize))
         if len(shape) < 3 or any(n > 1 for n in shape[3:]):
@@ -249,6 +256,7 @@ def read_nifti(
         code = int(image.header["xyzt_units"]) % 8
         if code not in _MM:
             raise ValueError(f"its unit of length is the unknown code {code}")
+        _warn_of_two_places(image.header)
         affine = image.affine.copy()
         affine[:3] *= _MM[code]
         matrix = affine[:3, :3]
@@ -267,6 +275,42 @@ def read_nifti(
         return np.ascontiguousarray(data), grid_from(data.shape, spacing, affine[:3, 3]), unit
 
 
+def _is_packed(path: str | os.PathLike[str]) -> bool:
+    """Whether a NIfTI is packed, by its ending in any capitals."""
+    return str(path).lower().endswith(".gz")
+
+
+def _image_kind(begin: bytes) -> Any:
+    """NIfTI-1 or 2, by the first four bytes."""
+    import nibabel
+
+    sizes = {int.from_bytes(begin, order) for order in ("little", "big")}
+    for kind in (nibabel.Nifti1Image, nibabel.Nifti2Image):
+        if kind.header_class.sizeof_hdr in sizes:
+            return kind
+    raise ValueError(
+        "it is empty" if not begin else "it does not begin as NIfTI does (a packed one is .nii.gz)"
+    )
+
+
+def _warn_of_two_places(header: Any) -> None:
+    """Warn where a NIfTI's sform and qform put voxels at different places: readers differ in which
+    one they take."""
+    if not (int(header["sform_code"]) > 0 and int(header["qform_code"]) > 0):
+        return
+    sform, qform = header.get_sform(), header.get_qform()
+    ends = np.array(list(itertools.product(*((0, n - 1) for n in header.get_data_shape()[:3]))))
+    apart = np.abs(ends @ (sform - qform)[:3, :3].T + (sform - qform)[:3, 3]).max()
+    voxel = np.abs(np.linalg.norm(sform[:3, :3], axis=0)).min()
+    if not apart <= _SAME_PLACE * voxel:
+        warnings.warn(
+            f"its sform and qform differ by up to {apart:.4g} of its units of length: the sform is "
+            "taken, as by nibabel, other programs take the qform; set both to the right one",
+            UserWarning,
+            stacklevel=2,
+        )
+
+
 def _check_packed(path: str | os.PathLike[str]) -> None:
     """Unpack a ``.nii.gz`` to its end, where its checksum stands: NiBabel stops after the last
     voxel.
@@ -274,15 +318,9 @@ def _check_packed(path: str | os.PathLike[str]) -> None:
     Raises:
         ValueError: it holds more than its header says.
     """
-    import nibabel
-
     with gzip.open(path) as file:
         begin = file.read(1024)
-        header: Any = (
-            nibabel.Nifti1Header
-            if begin[:4] in (b"\x5c\x01\0\0", b"\0\0\x01\x5c")
-            else nibabel.Nifti2Header
-        )
+        header: Any = _image_kind(begin[:4]).header_class
         held = header.from_fileobj(io.BytesIO(begin), check=False)
         bits, shape = int(held["bitpix"]), held.get_data_shape()
         check_size(shape, "the volume")
@@ -332,7 +370,11 @@ def read_meta_image(
     sitk = needed("SimpleITK")
     with reading(path, "a MetaImage"):
         reader = sitk.ImageFileReader()
+        with open(path, "rb") as file:
+            if b"=" not in file.read(256):
+                raise ValueError("it does not begin as a MetaImage does, with its fields")
         reader.SetFileName(str(path))
+        reader.SetImageIO("MetaImageIO")  # whatever capitals its ending has
         reader.ReadImageInformation()
         check_size(reader.GetSize(), "the volume")
         if reader.GetDimension() != 3 or reader.GetNumberOfComponents() != 1:

@@ -15,6 +15,7 @@ import math
 import os
 import re
 import shutil
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,7 +25,7 @@ import numpy as np
 
 from torchpcct.files import WriteError, atomic_write, require_folder
 from torchpcct.formats.damage import check_expansion, needed, reading
-from torchpcct.formats.lengths import MM
+from torchpcct.formats.lengths import MM, unit_text
 from torchpcct.formats.volume_files import nifti_header
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import UNITS
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     import zarr
     from numpy.typing import ArrayLike
 
-    from torchpcct.typing import Floats32, JsonObject, Reals
+    from torchpcct.typing import Floats, Floats32, JsonObject, Reals
 
 
 SLAB_ENDINGS = (".nii", ".zarr")
@@ -49,7 +50,7 @@ _CHUNK_PLANE = 256
 def check_slab_name(path: str | os.PathLike[str]) -> None:
     """Raise ``ValueError`` unless the ending of ``path`` names a format that is written slab by
     slab."""
-    if not str(path).endswith(SLAB_ENDINGS):
+    if not str(path).lower().endswith(SLAB_ENDINGS):
         raise ValueError(
             f"{Path(path).name!r} cannot be written slab by slab: use .nii or .zarr (OME-Zarr); "
             ".nii.gz, .mha, .h5 and DICOM hold what fits into memory"
@@ -69,6 +70,7 @@ class SlabFile:
         chunk: slices of a chunk of Zarr.
 
     Attributes:
+        store: whether it is an OME-Zarr.
         done: slices, from the lowest, that are on the disk.
         notes: JSON values that are kept with them.
 
@@ -97,6 +99,7 @@ class SlabFile:
                     f"another file than {path}"
                 )
         _require_own(self.path)
+        self.store = self.path.suffix.lower() == ".zarr"
         resumed = self.part.exists() and kept.get("key") == key
         self.done: int = kept["done"] if resumed else 0
         self.notes: JsonObject = kept["notes"] if resumed else {}
@@ -105,7 +108,7 @@ class SlabFile:
                 self.discard()
                 # before anything else, so that whatever is left says whose it is
                 self._note(begun=False)
-                if self.path.suffix == ".zarr":
+                if self.store:
                     _create(self.part, grid, unit, chunk)
                 else:
                     self.part.write_bytes(_nifti_header(grid, unit))
@@ -115,7 +118,7 @@ class SlabFile:
         """Put the next slices on the disk, float32 ``(slices, y, x)``."""
         values, first = np.ascontiguousarray(data, dtype="<f4"), self.done
         with self._writing():
-            if self.path.suffix == ".zarr":
+            if self.store:
                 _fill(
                     needed("zarr").open_group(self.part, mode="r+"),
                     slice(first, first + len(values)),
@@ -140,7 +143,7 @@ class SlabFile:
         """Give the volume its name; an OME-Zarr keeps the report. What had the name before is
         gone then."""
         with self._writing():
-            if self.path.suffix == ".zarr":
+            if self.store:
                 group = needed("zarr").open_group(self.part, mode="r+")
                 text = json.dumps(dict(report), default=str)
                 group.attrs["torchpcct"] = _about(self.unit, json.loads(text))
@@ -363,32 +366,30 @@ def read_ome_zarr(
         about = dict(group.attrs)
         image = about.get("ome", about)["multiscales"][0]
         array = group[image["datasets"][0]["path"]]
-        names = [axis["name"] for axis in image["axes"]]
+        names = [str(axis["name"] if isinstance(axis, dict) else axis) for axis in image["axes"]]
         leading = len(names) - 3
-        if names[leading:] != ["z", "y", "x"] or any(n != 1 for n in array.shape[:leading]):
+        if [n.lower() for n in names[leading:]] != ["z", "y", "x"] or any(
+            n != 1 for n in array.shape[:leading]
+        ):
             raise ValueError(
-                f"its axes are {', '.join(names)} of {array.shape}, expected one volume of z, y, x"
+                f"its axes are {', '.join(names)} of {array.shape}, expected one volume of z, y, x:"
+                " write it with its axes in that order, and each channel and time by itself"
             )
-        units = [str(axis.get("unit", "millimeter")) for axis in image["axes"][leading:]]
-        if not set(units) <= set(MM):
-            raise ValueError(
-                f"its lengths are in {', '.join(sorted(set(units) - set(MM)))}, which is no known "
-                "unit"
+        own = about.get("torchpcct")
+        units = [_unit_of(axis) for axis in image["axes"][leading:]]
+        if own is None and not all(units):
+            warnings.warn(
+                f"{path} gives its lengths no unit: they are taken for millimetres; put the unit "
+                "into its axes",
+                UserWarning,
+                stacklevel=2,
             )
-        lengths = [MM[name] for name in units]
+        lengths = [MM[unit or "mm"] for unit in units]
         check_expansion(array.shape, "the volume", array.nbytes_stored)
-        spacing, first = np.ones(3), np.zeros(3)
-        for transforms in (image["datasets"][0], image):  # of the resolution, then of all
-            for step in transforms.get("coordinateTransformations", []):
-                if step["type"] == "scale":
-                    factor = np.array(step["scale"][leading:], dtype=np.float64)
-                    spacing, first = spacing * factor, first * factor
-                elif step["type"] == "translation":
-                    first = first + np.array(step["translation"][leading:], dtype=np.float64)
+        spacing, first = _placed(image, leading)
         spacing, first = spacing * lengths, first * lengths
         shape = tuple(array.shape[leading:])
         center = first + spacing * (np.array(shape) - 1) / 2
-        own = about.get("torchpcct")
         stored = None if own is None else own.get("unit", "HU")
         if stored is not None and stored not in UNITS:
             raise ValueError(f"it gives the unit {stored!r}, expected {' or '.join(UNITS)}")
@@ -397,6 +398,63 @@ def read_ome_zarr(
         grid = VolumeGrid(shape, tuple(map(float, spacing)), tuple(map(float, center)))
         data = _chunk_by_chunk(array, Path(path) / image["datasets"][0]["path"], own is not None)
         return data.reshape(shape), grid, stored or unit or "HU"
+
+
+def _unit_of(axis: object) -> str:
+    """Unit of length of an axis of an OME-Zarr, in small letters; empty: it has none.
+
+    Raises:
+        ValueError: no known unit.
+    """
+    given = axis.get("unit") if isinstance(axis, dict) else None
+    unit = "" if given is None else unit_text(np.array(given))
+    if unit and unit not in MM:
+        raise ValueError(
+            f"its lengths are in {unit!r}, which is no known unit: write them in millimeter, "
+            "micrometer or another power of ten of a meter"
+        )
+    return unit
+
+
+def _placed(image: Mapping[str, Any], leading: int) -> tuple[Floats, Floats]:
+    """Spacing and place of the first voxel of an OME-Zarr in its own units, ``(3,)`` of z, y, x.
+
+    Args:
+        image: one of its multiscales.
+        leading: axes before z.
+
+    Raises:
+        ValueError: no scale, one of another number of axes, or what is none of scale and
+            translation.
+    """
+    spacing, first, scaled = np.ones(3), np.zeros(3), False
+    for transforms in (image["datasets"][0], image):  # of the resolution, then of all
+        for step in transforms.get("coordinateTransformations", []):
+            kind = step["type"]
+            if kind == "identity":
+                continue
+            if kind not in ("scale", "translation"):
+                raise ValueError(
+                    f"its coordinateTransformations hold an operation {kind!r}: resample it to "
+                    "straight axes, which a scale and a translation place"
+                )
+            if kind not in step:
+                raise ValueError(f"its {kind} lies in another file: write its numbers beside it")
+            values = np.array(step[kind], dtype=np.float64)
+            if values.size != 3 + leading:
+                raise ValueError(
+                    f"its {kind} has {values.size} numbers, of {3 + leading} axes: one for each"
+                )
+            values = values[leading:]
+            if kind == "scale":
+                spacing, first, scaled = spacing * values, first * values, True
+            else:
+                first = first + values
+    if not scaled:
+        raise ValueError(
+            "its coordinateTransformations have no scale, the size of a voxel: write it there"
+        )
+    return spacing, first
 
 
 def _chunk_by_chunk(array: zarr.Array, folder: Path, whole: bool) -> Floats32:

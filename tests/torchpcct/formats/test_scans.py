@@ -83,6 +83,32 @@ def test_without_a_pixel_size_lengths_are_in_pixels(tmp_path, size, unit):
         open_scan(path, mu_water=0.04)
 
 
+@pytest.mark.parametrize(
+    ("size", "unit", "pitch"),
+    [(5e-4, "mm^-1", 0.5), (0.65, "pixel^-1", 1.0), (1.3, "pixel^-1", 1.0)],
+)
+def test_a_pixel_size_without_a_unit_is_in_metres_or_unknown(tmp_path, size, unit, pitch):
+    """Beamlines write µm or mm without saying so: 650 mm wide pixels are none."""
+    path = tooth(tmp_path / "tooth.h5")
+    with h5py.File(path, "a") as file:
+        del file["measurement"]
+        file["measurement/instrument/detector/pixel_size"] = size
+    scan = open_scan(path)
+    assert (scan.unit, scan.geometry.pitch) == (unit, pytest.approx(pitch))
+
+
+@pytest.mark.parametrize(("white", "dark"), [(0.0, 0.0), (100.0, 300.0)])
+def test_frames_of_dark_in_the_place_of_white_are_named(tmp_path, white, dark):
+    path = tooth(tmp_path / "tooth.h5")
+    with h5py.File(path, "a") as file:
+        shape = file["exchange/data"].shape[1:]
+        for name, value in (("data_white", white), ("data_dark", dark)):
+            file.pop(f"exchange/{name}", None)
+            file[f"exchange/{name}"] = np.full((5, *shape), value)
+    with pytest.raises(ValueError, match="air is not brighter than dark: are the two exchanged"):
+        open_scan(path)
+
+
 def test_pixel_sizes_in_every_unit(tmp_path):
     path = tooth(tmp_path / "tooth.h5")
     for mm, units in (

@@ -42,6 +42,53 @@ def test_round_trip(tmp_path, name):
     )
 
 
+@pytest.mark.parametrize(
+    "name", ["v.NII.GZ", "v.Nii.gz", "v.nii.Gz", "v.Nii", "v.MHA", "v.H5", "v.Zarr"]
+)
+def test_endings_in_capitals_mean_what_small_ones_do(tmp_path, name):
+    Volume(DATA, GRID).save(tmp_path / name)
+    assert torch.equal(Volume.load(tmp_path / name).data, DATA)
+    if name.lower().endswith(".gz"):
+        assert (tmp_path / name).read_bytes()[:2] == b"\x1f\x8b"
+    small = tmp_path / name.lower()
+    (tmp_path / name).rename(small)
+    assert torch.equal(Volume.load(small).data, DATA)
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e-3, 5.0])
+@pytest.mark.parametrize("factor", [1.0, 2.0, -1.0])
+def test_sform_and_qform_that_disagree_are_said(tmp_path, factor, shift):
+    """ITK takes the qform, nibabel the sform."""
+    affine = np.diag([0.5, 0.5, 2.0, 1.0])
+    affine[:3, 3] = 10.0, 20.0, 30.0
+    image = nibabel.load(nifti(tmp_path / "v.nii", affine))
+    other = affine @ np.diag([factor, 1.0, 1.0, 1.0])
+    other[2, 3] += shift
+    image.header.set_qform(other, code=1)
+    nibabel.save(nibabel.Nifti1Image(image.get_fdata(), None, image.header), tmp_path / "w.nii")
+    if factor == 1.0 and shift < 0.1:
+        grid = Volume.load(tmp_path / "w.nii").grid
+    else:
+        with pytest.warns(UserWarning, match="its sform and qform differ by up to [0-9.]+ of its"):
+            grid = Volume.load(tmp_path / "w.nii").grid
+    assert grid.spacing == (2.0, 0.5, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("v.nii", b"", "it is empty"),
+        ("v.nii.gz", b"", "it is empty"),
+        ("v.nii", b"\x1f\x8b" + bytes(400), "it does not begin as NIfTI does"),
+        ("v.mha", b"", "it does not begin as a MetaImage does"),
+    ],
+)
+def test_files_that_hold_something_else(tmp_path, name, content, said):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=f"{name} cannot be read as .*{said}"):
+        Volume.load(tmp_path / name)
+
+
 def nifti(path, affine, unit=None, shape=(5, 4, 3), sform=True):
     image = nibabel.Nifti1Image(np.arange(np.prod(shape), dtype=np.float32).reshape(shape), affine)
     image.header.set_sform(affine, code=1 if sform else 0)

@@ -135,15 +135,51 @@ def test_other_software_may_leave_out_chunks_of_the_fill_value(tmp_path):
 @pytest.mark.parametrize(
     ("attributes", "said"),
     [
-        (image(unit="furlong"), "its lengths are in furlong, which is no known unit"),
-        (image("xyz"), "its axes are x, y, z"),
+        (image(unit="furlong"), "its lengths are in 'furlong', which is no known unit: write"),
+        (image("xyz"), "its axes are x, y, z.*write it with its axes in that order"),
         (image("yx", scale=(1.0, 1.0)), "its axes are y, x"),
+        (image(scale=(2.0, 1.0)), "its scale has 2 numbers, of 3 axes"),
+        ({**image(), "datasets": [{"path": "0"}]}, "have no scale, the size of a voxel"),
+        (
+            {**image(), "coordinateTransformations": [{"type": "rotation", "rotation": [0.0]}]},
+            "an operation 'rotation': resample it to straight axes",
+        ),
+        (
+            {**image(), "coordinateTransformations": [{"type": "scale", "path": "s"}]},
+            "its scale lies in another file",
+        ),
     ],
 )
 def test_axes_and_units_that_are_not_understood(tmp_path, attributes, said):
     older(tmp_path / "v.zarr", {"ome": {"multiscales": [attributes]}})
     with pytest.raises(ValueError, match=said):
         Volume.load(tmp_path / "v.zarr")
+
+
+@pytest.mark.parametrize(
+    ("names", "unit", "mm"),
+    [("zyx", "Micrometer", 1e-3), ("ZYX", "angstrom", 1e-7), ("zyx", "inch", 25.4)],
+)
+def test_units_and_axes_in_any_capitals(tmp_path, names, unit, mm):
+    about = image(names, unit)
+    about["coordinateTransformations"] = [{"type": "identity"}]
+    older(tmp_path / "v.zarr", {"ome": {"multiscales": [about]}})
+    spacing = Volume.load(tmp_path / "v.zarr").grid.spacing
+    np.testing.assert_allclose(spacing, np.array((2.0, 1.0, 0.5)) * mm)
+
+
+@pytest.mark.parametrize("unit", [None, ""])
+def test_lengths_without_a_unit_are_taken_for_millimetres_and_said(tmp_path, unit):
+    about = image()
+    for axis in about["axes"]:
+        axis["unit"] = unit
+    older(tmp_path / "v.zarr", {"ome": {"multiscales": [about]}})
+    with pytest.warns(UserWarning, match="gives its lengths no unit: they are taken for mill"):
+        assert Volume.load(tmp_path / "v.zarr").grid.spacing == (2.0, 1.0, 0.5)
+    # A volume of ours of unknown pixels has none, and that is said by its own unit.
+    grid = VolumeGrid((3, 4, 5), 1.0)
+    Volume(torch.ones(3, 4, 5), grid, unit="pixel^-1").save(tmp_path / "own.zarr")
+    assert Volume.load(tmp_path / "own.zarr").unit == "pixel^-1"
 
 
 def test_metadata_keep_one_digest_of_themselves(written):
