@@ -2,6 +2,7 @@
 invented."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import recon
 from recon.analytic.coverage import _at_rest, consistency_warnings
 from recon.analytic.inset import InsetFbp, view_motion
 from recon.least_squares.inset_problem import InsetProblem
-from recon.motion import _basis, _believed, _likelihood, _Problem, estimate_motion
+from recon.motion import _about, _basis, _believed, _Found, _likelihood, _Problem, estimate_motion
 from recon.study.motion_found import Jump
 from recon.study.paths import KINDS, true_path
 from recon.variable_projection import Normal
@@ -178,7 +179,9 @@ def test_errors_cover_what_noise_does(moving):
 
 
 @pytest.mark.extended
-def test_a_beating_heart(moving):
+def test_a_beating_heart(moving, monkeypatch):
+    """It does not jump: nothing of the kind is looked for."""
+    monkeypatch.setattr("recon.motion._with_jump", None)
     beat = SinusoidalMotion("vessel", 0.8, rate_bpm=100.0, direction=1.0)
     scan = _scan(beat).with_noise(EXPOSURE_S, 0)
     found = estimate_motion(scan, GRID, heart_rate=100.0, rotation_s=TURN_S)
@@ -240,6 +243,43 @@ def test_a_jump_is_told_from_a_smooth_path():
         assert found.mean[-1] == pytest.approx([0.0, 0.18 * jumps, 0.24 * jumps], abs=0.07)
         off = columns @ found.mean - np.outer(path, [0.0, 0.6, 0.8])
         assert np.sqrt((off**2).mean()) < 0.03
+
+
+def test_a_jump_has_the_view_the_size_and_the_errors_of_its_coefficients():
+    """The last one of each axis, at the first of the views that were averaged."""
+    errors = np.arange(1.0, 10.0)
+    problem = SimpleNamespace(jump=3, first_view=lambda view: 10 * view)
+    found = SimpleNamespace(
+        problem=problem,
+        coefficients=np.array([[9.0, 9.0, 9.0], [9.0, 9.0, 9.0], [0.0, 0.3, 0.4]]),
+        belief=SimpleNamespace(covariance=np.diag(errors**2)),
+    )
+    jump = _Found.jump.fget(found)
+    assert jump.view == 30
+    assert jump.length == pytest.approx(0.5)
+    assert jump.errors == pytest.approx([3.0, 6.0, 9.0], rel=1e-3)
+    problem.jump = None
+    assert _Found.jump.fget(found) is None
+
+
+def test_a_jump_of_averaged_views_is_one_between_two_of_the_scan():
+    averaged = SimpleNamespace(_averaging=np.kron(np.eye(4), np.full(2, 0.5)))
+    assert _Problem.first_view(averaged, 2) == 4
+    assert _Problem.late(averaged, 2) == pytest.approx([-0.5] * 4 + [0.5] * 4)
+    assert _Problem.late(averaged, 3) == pytest.approx([-0.25] * 6 + [0.75] * 2)
+
+
+def test_a_jump_at_the_same_view_is_no_gain(moving):
+    """Nor are views before the first and behind the last asked for."""
+    problem = _Problem(moving.with_noise(EXPOSURE_S, 0), GRID, None).with_jump(24)
+    at = np.zeros((problem.basis.shape[1], 3))
+    effects = problem.at(at)[1]
+    same, other = problem.gains([24, 12], at, effects)
+    assert same == pytest.approx(0.0, abs=1e-6)
+    assert abs(other) > 1e-3
+    found = SimpleNamespace(problem=problem)
+    assert _about(found, 2, 4) == [1, 3, 4, 5, 6]
+    assert _about(found, 46, 2) == [44, 45, 47]
 
 
 def test_voxels_are_no_larger_than_cells(moving):

@@ -8,9 +8,10 @@ import torch
 from analytic import Ellipsoid, line_integrals
 from scipy.ndimage import uniform_filter
 
+from recon.analytic import few_photons
 from recon.analytic.few_photons import bias_warnings
 from recon.analytic.water_unit import row_image
-from torchpcct import FanBeam, Scan, full_turn
+from torchpcct import ConeBeam, FanBeam, Scan, full_turn
 
 MU = 0.02
 G = FanBeam(full_turn(240), 570.0, 1040.0, 128, 3.6, 0.9)
@@ -82,3 +83,51 @@ def test_rays_of_no_photons_are_not_known():
     assert "their number is not known" in text
     assert "too low" in text
     assert size > 200.0
+
+
+@pytest.fixture
+def foretold(monkeypatch):
+    """Warnings where line integrals are off by a share of them, as is known or not."""
+
+    def texts(share, sure=True, scan=None, geometry=G, of=LINES):
+        scan = (
+            Scan.from_line_integrals(LINES, G, photons=100.0, mu_water=MU) if scan is None else scan
+        )
+        error = torch.as_tensor(share * of)
+        monkeypatch.setattr(few_photons, "logarithm_error", lambda scan: (error, sure))
+        lines = scan.line_integrals()
+        return bias_warnings(
+            scan, lines if lines.ndim == 2 or geometry.has_rows else lines[1], geometry
+        )
+
+    return texts
+
+
+def test_twice_the_error_is_tolerated_where_it_is_not_known_well(foretold):
+    """At the brighter body it is twice its share of the rest."""
+    counts = Scan.from_counts(read(100.0), G, air=100.0, mu_water=MU)
+    assert "too high" in foretold(0.011)[0]
+    assert "too low" in foretold(-0.011)[0]
+    assert not foretold(0.005)
+    for less in ({"sure": False}, {"scan": counts}):
+        assert not foretold(0.011, **less)
+        assert foretold(0.022, **less)
+
+
+def test_the_size_is_in_the_unit_of_the_volume(foretold):
+    (text,) = foretold(0.1)
+    assert float(re.findall(r"by about ([\d.e+]+) HU", text)[0]) == pytest.approx(200.0, rel=0.2)
+    (text,) = foretold(0.1, scan=Scan.from_line_integrals(LINES, G, photons=100.0))
+    size = float(re.findall(r"by about ([\d.e-]+) mm\^-1", text)[0])
+    assert size == pytest.approx(0.2 * MU, rel=0.2)
+
+
+def test_the_row_and_the_slice_that_are_shown_are_looked_at(foretold):
+    """The row that is off by most, and the middle slice of a stack."""
+    cone = ConeBeam(G.angles, G.sod, G.sdd, G.columns, 3, (3.6, G.pitch), (0.0, G.offset))
+    rows = np.stack([0.0 * LINES, LINES, 0.0 * LINES], 1)
+    scan = Scan.from_line_integrals(np.stack([LINES] * 3, 1), cone, photons=100.0, mu_water=MU)
+    assert foretold(0.1, scan=scan, geometry=cone, of=rows)
+    stack = Scan.from_line_integrals(np.stack([LINES] * 3), G, photons=100.0, mu_water=MU)
+    assert foretold(0.1, scan=stack, of=np.stack([0.0 * LINES, LINES, 0.0 * LINES]))
+    assert not foretold(0.1, scan=stack, of=np.stack([LINES, 0.0 * LINES, LINES]))

@@ -6,6 +6,7 @@ import pytest
 import torch
 from inset_operators import CENTER, HU, matrix, problem, tissue
 from refusals import refused
+from standin import DEVICE, standin
 
 from recon.gram.gram import Gram, make_definite
 from torchpcct import FanBeam, Projector, VolumeGrid
@@ -162,10 +163,48 @@ def test_noise_has_the_covariance_of_the_data(inset):
         assert variance == pytest.approx(expected, rel=5 * math.sqrt(2 / n) + 0.03)
 
 
+def test_noise_grows_as_the_root_of_the_exposure(inset):
+    gram = inset[2]
+    once, longer = (
+        g.noise(generator=torch.Generator().manual_seed(3)) for g in (gram, gram.scaled(4.0))
+    )
+    torch.testing.assert_close(longer, 2.0 * once)
+
+
+def test_the_spectrum_is_what_waves_on_the_grid_meet():
+    """Periodic ones, of all directions: their quadratic forms."""
+    A, w = problem(shape=(6, 12, 13), rows=8)
+    gram = Gram(A, w, nodes=1)
+    spectrum = gram.periodic_spectrum()
+    z, y, x = torch.meshgrid(*map(torch.arange, A.domain_shape), indexing="ij")
+    for k in ((0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3), (2, 3, 1), (5, 10, 4)):
+        phase = 2.0 * math.pi * (k[0] * z / 6 + k[1] * y / 12 + k[2] * x / 13)
+        waves = torch.stack([phase.cos(), phase.sin()])
+        met = float((waves * gram.apply(waves)).sum()) / phase.numel()
+        assert float(spectrum[k]) == pytest.approx(met, rel=0.02)
+
+
+def test_information_is_read_off_by_the_law_of_the_ramp(inset):
+    """Of a wave that voxels hold, and of finer ones that they do not."""
+    gram = inset[2]
+    finest = 0.25 / 0.4
+    held, beyond = gram.information(HU, finest), gram.information(HU, 4.0 * finest)
+    assert beyond == pytest.approx(held / 4.0, rel=1e-6)
+
+
 def test_all_of_it_moves_to_another_device(inset):
     moved = inset[2].to("meta")
     held = {name: v.device.type for name, v in vars(moved).items() if isinstance(v, torch.Tensor)}
     assert set(held.values()) == {"meta"}, held
+
+
+def test_on_a_device_it_is_the_same_operator(inset):
+    A, _, gram = inset
+    x = torch.randn(A.domain_shape, generator=torch.Generator().manual_seed(2))
+    expected = gram.apply(x)
+    with standin():
+        found = gram.to(DEVICE).apply(x.to(DEVICE)).cpu()
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
 
 
 def test_nearly_zero_weights():
