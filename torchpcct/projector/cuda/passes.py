@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from torchpcct.typing import Floats
 
 LANES = 128
-"""Columns or voxels of a program of a plane; of a cone beam at most twice as many rows or slices."""
+"""Columns or voxels of a program of a plane; of a cone beam at most twice as many rows or
+slices."""
 _STEPS = 2
 """Steps of a segment's look-up table for each of its columns."""
 
