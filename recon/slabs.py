@@ -41,6 +41,7 @@ from recon.jobs.store import Store
 from recon.least_squares.memory import pwls_bytes, resident_bytes
 from recon.least_squares.qggmrf import QGGMRF
 from recon.metal import metal_warnings
+from recon.names import METHODS
 from torchpcct.checks.defects import (
     Cells,
     cell_sums,
@@ -457,6 +458,11 @@ def plan_slabs(
 
 
 def _check(geometry: Geometry, grid: VolumeGrid, method: str) -> None:
+    if method in METHODS and method not in ("fbp", "pwls"):
+        raise ValueError(
+            f"method={method!r} needs the whole volume at once: leave out memory=, or take fbp or "
+            "pwls slab by slab"
+        )
     choice("method", method, ("fbp", "pwls"))
     if not geometry.on_circle:
         raise ValueError(

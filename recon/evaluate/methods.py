@@ -325,13 +325,22 @@ def volume_files(folder: Path) -> dict[str, Path]:
     folders of DICOM.
 
     What lies beside them (summaries, hidden files) is left out. Names may hold dots.
+
+    Raises:
+        ValueError: two volumes of one name in several formats.
     """
     found: dict[str, Path] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
         ending = next((e for e in _VOLUMES if path.name.lower().endswith(e)), "")
         if path.name.startswith(".") or not (ending or path.is_dir()):
             continue
-        found[path.name[: len(path.name) - len(ending)]] = path
+        name = path.name[: len(path.name) - len(ending)]
+        if name in found:
+            raise ValueError(
+                f"{found[name]} and {path.name} are volumes of one name: leave one of them in the "
+                "folder"
+            )
+        found[name] = path
     return found
 
 

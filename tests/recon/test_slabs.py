@@ -228,6 +228,13 @@ def test_no_more_than_a_band_is_in_memory(tmp_path, monkeypatch):
     assert 7 * 4 * 60 * 64 * max(rows) <= 4_200_000
 
 
+def test_a_method_that_needs_the_whole_volume_is_named(tmp_path):
+    with pytest.raises(ValueError, match="method='mbir' needs the whole volume at once: leave out"):
+        reconstruct_to(made(CONE), GRID, tmp_path / "v.nii", "mbir", memory="1GB")
+    with pytest.raises(ValueError, match="unknown method 'fpb'"):
+        reconstruct_to(made(CONE), GRID, tmp_path / "v.nii", "fpb", memory="1GB")
+
+
 def test_a_limit_that_is_too_small_names_the_smallest_that_works(tmp_path):
     scan = made(CONE)
     with pytest.raises(
@@ -305,7 +312,7 @@ def test_what_slabs_do_not_do_is_refused_by_name(tmp_path):
     bins = replace(scan, counts=scan.counts[None], air=scan.air[None])
     refused(
         ("couples all slices", lambda: reconstruct_to(scan, GRID, path, "pwls")),
-        ("unknown method 'mbir'", lambda: reconstruct_to(scan, GRID, path, "mbir")),
+        ("method='mbir' needs the whole volume", lambda: reconstruct_to(scan, GRID, path, "mbir")),
         (
             r"v\.nii\.gz' cannot be written slab",
             lambda: reconstruct_to(scan, GRID, tmp_path / "v.nii.gz"),

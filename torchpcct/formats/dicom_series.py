@@ -44,6 +44,8 @@ _MOST_INFLATED = 2**27
 """Bytes that such a data set may have: an image of 8192² pixels."""
 _CT_CLASS = "1.2.840.10008.5.1.4.1.1.2"
 """CT Image Storage, and the beginning of its enhanced classes."""
+_PIXELS = ("PixelData", "FloatPixelData", "DoubleFloatPixelData")
+"""What may hold the pixels of an image."""
 _MADE_BY = "torchpcct"
 """Manufacturer in files that are written."""
 _HU_RANGE = (-32768, 32767)
@@ -66,12 +68,14 @@ def dicom_files(folder: str | os.PathLike[str]) -> list[Path]:
     does. A file that ends like DICOM, or has no ending, is one, damaged or not.
 
     Raises:
-        FileNotFoundError: none. ValueError: a device or a pipe.
+        FileNotFoundError: none; a link to nothing. ValueError: a device or a pipe.
     """
     found = []
     for path in sorted(Path(folder).iterdir()) if Path(folder).is_dir() else []:
         if path.name.startswith(".") or path.is_dir():
             continue
+        if not path.exists():
+            raise FileNotFoundError(f"{path} is a link to nothing: take it away")
         require_ordinary(path)
         with path.open("rb") as file:
             begin = file.read(1024)
@@ -107,12 +111,19 @@ def open_dicom(path: str | os.PathLike[str], **options: object) -> pydicom.Datas
         options: of ``pydicom.dcmread``.
 
     Raises:
-        ValueError: a deflated data set of more than 128 MiB, which no image is; several frames;
-            colours.
-        pydicom.errors.InvalidDicomError: no DICOM.
+        ValueError: no DICOM; a deflated data set of more than 128 MiB, which no image is; several
+            frames; colours.
         ImportError: pydicom is not installed.
     """
     pydicom = needed("pydicom")
+    with open(path, "rb") as file:
+        begin = file.read(_PREAMBLE + len(_MARK))
+    if begin[_PREAMBLE:] != _MARK:
+        raise ValueError(
+            "it is empty: take it away, or copy it again"
+            if not begin
+            else "it does not begin as DICOM does: take it away, or copy it again"
+        )
     if str(pydicom.filereader.read_file_meta_info(path).get("TransferSyntaxUID", "")) == _DEFLATED:
         _check_inflated(path, pydicom)
     data = pydicom.dcmread(path, **options)
@@ -266,13 +277,11 @@ def read_dicom(
     for file in paths:
         with reading(file, "a DICOM image"):
             d = open_dicom(file)
-            if (
-                root.is_dir()
-                and "Rows" not in d
-                and not str(d.get("SOPClassUID", "")).startswith(_CT_CLASS)
-            ):
+            if root.is_dir() and "Rows" not in d and not _may_be_ct(d):
                 _LOG.info("%s holds no image: left out", file)  # reports, contours and the like
                 continue
+            if not any(name in d for name in _PIXELS):
+                raise ValueError("it ends before its pixels: copy it again")
             if not slices:
                 check_expansion(
                     (len(paths), d.Rows, d.Columns),
@@ -305,6 +314,17 @@ def read_dicom(
             stacklevel=3,
         )
     return data, grid, unit or "HU"
+
+
+def _may_be_ct(d: pydicom.Dataset) -> bool:
+    """Whether a data set names the class of CT images, or none: the beginning of one that was cut
+    off."""
+    named = [
+        str(d.get("SOPClassUID") or ""),
+        str(d.file_meta.get("MediaStorageSOPClassUID") or ""),
+    ]
+    begins = [name for name in named if name] or [""]
+    return any(name.startswith(_CT_CLASS) or _CT_CLASS.startswith(name) for name in begins)
 
 
 def _hounsfield(d: pydicom.Dataset, unit: str | None, ours: bool) -> tuple[Floats32, int]:

@@ -17,7 +17,7 @@ from tiny_studies import INSERT
 from recon.evaluate.estimates import _Figures, pivot
 from recon.evaluate.experiment import evaluate
 from recon.evaluate.measure import Reader, kept_as
-from recon.evaluate.methods import Method, denoiser, method_of
+from recon.evaluate.methods import Method, denoiser, method_of, volume_files
 from recon.evaluate.names import TASKS
 from recon.evaluate.realisations import Realisations
 from recon.evaluate.report import COLUMNS, save, text_of
@@ -353,6 +353,16 @@ def test_pieces_of_another_seed_method_or_exposure_are_not_taken(task, tmp_path)
 def test_bad_methods_are_named(spec, expected_text):
     with pytest.raises((ValueError, TypeError, FileNotFoundError), match=expected_text):
         method_of(spec)
+
+
+def test_two_volumes_of_one_name_are_refused(tmp_path):
+    volume = Volume(torch.zeros(2, 3, 4), VolumeGrid((2, 3, 4), 1.0))
+    for name in ("a.nii", "b_fbp.NII.GZ", "c.4", "1.2.3.zarr"):
+        volume.save(tmp_path / name)
+    assert set(volume_files(tmp_path)) == {"a", "b_fbp", "c.4", "1.2.3"}
+    volume.save(tmp_path / "a.mha")
+    with pytest.raises(ValueError, match=r"a\.mha and a\.nii are volumes of one name: leave one"):
+        volume_files(tmp_path)
 
 
 @pytest.mark.extended

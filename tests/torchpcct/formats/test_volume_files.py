@@ -313,10 +313,31 @@ def test_what_archives_leave_beside_slices_is_left_out_and_damaged_slices_are_no
         with pytest.raises(ValueError, match=f"{name} cannot be read as a DICOM image"):
             Volume.load(folder)
         (folder / name).unlink()
+    (folder / "0005.dcm").symlink_to(folder / "gone.dcm")
+    with pytest.raises(FileNotFoundError, match=r"0005\.dcm is a link to nothing: take it away"):
+        Volume.load(folder)
+    (folder / "0005.dcm").unlink()
+    (folder / "0005.dcm").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"0005\.dcm cannot be read .*it is empty: take it away"):
+        Volume.load(folder)
+    (folder / "0005.dcm").unlink()
     slices = [folder / f"000{k}.dcm" for k in (1, 2, 3, 4)]
     for path in slices:
         path.rename(path.with_suffix(""))
     assert torch.equal(Volume.load(folder).data, DATA)
+
+
+@pytest.mark.parametrize("slice_number", [2, 4])
+def test_a_slice_that_ends_early_is_never_left_out(series, slice_number):
+    """Of a series of others nothing says how many slices there are: cut off at any byte, the last
+    one was taken for a report without an image."""
+    path = series(lambda d: setattr(d, "Manufacturer", "X")) / f"000{slice_number}.dcm"
+    content = path.read_bytes()
+    pixels = content.index(b"\xe0\x7f\x10\x00")
+    for length in (132, 144, 156, 180, 407, *range(1, pixels + 8, 50), len(content) - 1):
+        path.write_bytes(content[:length])
+        with pytest.raises(ValueError, match=f"000{slice_number}.dcm cannot be read as a DICOM"):
+            Volume.load(path.parent)
 
 
 def _no_rescale(d):
