@@ -84,6 +84,10 @@ _HARMONICS = 2
 """Of the heart's rate, if that is given."""
 _REACH_MM = 2.5
 """Largest displacement from the mean that is looked for."""
+_REACH_ALONG_MM = 1.0
+"""Farthest from the mean along the axis of the turn. A vessel along it shows little of such a
+motion: one that moved by 1.2 mm, 0.75 from its mean, was followed, of 2 mm the path was wrong by
+more than the motion (the case "along z" of ``torchpcct study motion``)."""
 _TIMES = 2
 """How often what a volume explains is taken off, beside the first time."""
 _STEPS = 6
@@ -672,7 +676,7 @@ def estimate_motion(
     Raises:
         ValueError: an unknown exterior, energy bins, another geometry, fewer than 48 views, a
             heart's rate without the time of a turn. PathTooLongError: a path that leads further
-            than 2.5 mm away from its mean.
+            than 2.5 mm away from its mean, or than 1 mm along the axis.
         TypeError: no :class:`torchpcct.Scan`.
     """
     _require_inset(scan)
@@ -687,6 +691,13 @@ def estimate_motion(
     path, errors, belief = found.path, found.errors, found.belief
     size, error = _rms(path), _rms(errors)
     held = belief.evidence >= _LEAST_EVIDENCE and size > max(_FLOOR_MM, error)
+    along = float(np.abs(path[:, 0]).max())
+    if held and along > _REACH_ALONG_MM:
+        raise PathTooLongError(
+            f"the path that fits leads {along:.2g} mm away from its mean along the axis, more than "
+            f"the {_REACH_ALONG_MM:g} mm up to which such a path can be trusted: give the "
+            "displacement in every view, motion=path, or reconstruct a part of the turn"
+        )
     after = found.problem.at(found.coefficients, found.effects)[0].misfit if held else rest
     jump = found.jump if held else None
     texts = []

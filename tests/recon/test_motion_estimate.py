@@ -11,11 +11,12 @@ import torch
 from refusals import refused
 
 import recon
+import recon.motion
 from recon.analytic.coverage import _at_rest, consistency_warnings
 from recon.analytic.inset import InsetFbp, view_motion
 from recon.least_squares.inset_problem import InsetProblem
 from recon.motion import _about, _basis, _believed, _Found, _likelihood, _Problem, estimate_motion
-from recon.study.motion_found import Jump
+from recon.study.motion_found import AlongAxis, Jump
 from recon.study.paths import KINDS, true_path
 from recon.variable_projection import Normal
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, acquire, full_turn
@@ -144,6 +145,17 @@ def test_a_jump_is_found_and_said():
     assert np.median(np.linalg.norm(off, axis=1)) < 0.05
     assert "its motion is not smooth" in found.warnings[0]
     assert found.report()["jump"]["view"] == found.jump.view
+
+
+def test_a_path_far_along_the_axis_is_refused(monkeypatch):
+    scan = _scan(AlongAxis("vessel", 0.8)).with_noise(EXPOSURE_S, 0)
+    path = estimate_motion(scan, GRID).path
+    assert 0.2 < np.abs(path[:, 0]).max() < recon.motion._REACH_ALONG_MM
+    monkeypatch.setattr(recon.motion, "_REACH_ALONG_MM", 0.1)
+    with pytest.raises(
+        recon.motion.PathTooLongError, match=r"along the axis, more than the 0\.1 mm"
+    ):
+        estimate_motion(scan, GRID)
 
 
 def test_no_motion_is_invented():
