@@ -26,8 +26,6 @@ ENTRIES = 6
 position exceeds a whole one, and the displacement upwards (mm)."""
 LANES = 128
 """Pixels of a program of a plane, and voxels of one of a volume."""
-LANES_PER_WARP = 32
-"""Of a volume: more let a thread share the place in the plane among its slices."""
 
 
 @triton.jit
@@ -212,7 +210,7 @@ def backproject_plane(
         TERMS=len(atan),
         ENTRIES=ENTRIES,
         BLOCK=block,
-        num_warps=_warps(block, 32),
+        num_warps=_warps(block),
     )
 
 
@@ -258,7 +256,7 @@ def backproject_volume(
         ENTRIES=ENTRIES,
         ALONG=along,
         BLOCK=block,
-        num_warps=_warps(along * block, LANES_PER_WARP),
+        num_warps=_warps(along * block),
     )
     out.copy_(volume.permute(0, 3, 1, 2))
 
@@ -268,5 +266,5 @@ def _ends(cells: int) -> tuple[int, int]:
     return min(cells - 1, 1), max(cells - 2, 0)
 
 
-def _warps(lanes: int, each: int) -> int:
-    return max(1, min(4, lanes // each))
+def _warps(lanes: int) -> int:
+    return max(1, min(4, lanes // 32))

@@ -208,13 +208,11 @@ def _row(estimates: list[InsetMotion | None], truth: NDArray[np.float64] | None)
         "jumps": sum(f.jump is not None for f in found),
         "warned": sum(any("move differently" in text for text in f.warnings) for f in found),
     }
-    if truth is None:
-        return row | {"true_mm": None, "error_mm": None, "inside": None}
-    if not found:
-        return row | {"true_mm": rms(truth), "error_mm": None, "inside": None}
+    row |= {"true_mm": None if truth is None else rms(truth), "error_mm": None, "inside": None}
+    if truth is None or not found:
+        return row
     inside = [np.abs(f.path - truth) <= 2.0 * f.errors for f in found]
     return row | {
-        "true_mm": rms(truth),
         "error_mm": rms([f.path - truth for f in found]),
         "inside": float(np.mean(inside)),
     }

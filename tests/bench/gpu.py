@@ -238,15 +238,11 @@ def gradient_agreement(bench: Bench, case: Any) -> dict[str, Any]:
 
 def chain_agreement(bench: Bench, method: str, kind: str, **options: Any) -> dict[str, Any]:
     """HU between the volumes of one scan on the CPU and on the device."""
-    scan, grid = chain_scan(kind, bench.tiny)
+    scan, grid = field_scan(kind, *((8, 12) if bench.tiny else (64, 180)))
     here = reconstruct(scan, grid, method, **options)
     there = reconstruct(scan, grid, method, device=bench.device, **options)
     off = float((there.data.cpu() - here.data).abs().max())
     return {"hu_apart": off, "on_cpu": there.report.get("on_cpu", []), "agrees": off < 1.0}
-
-
-def chain_scan(kind: str, tiny: bool) -> tuple[Scan, VolumeGrid]:
-    return field_scan(kind, *((8, 12) if tiny else (64, 180)))
 
 
 def field_scan(kind: str, n: int, views: int) -> tuple[Scan, VolumeGrid]:

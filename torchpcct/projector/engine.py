@@ -48,7 +48,7 @@ class Engine:
 
     def __init__(self, tables: Tables | VectorTables) -> None:
         self.tables = tables
-        self._devices: dict[torch.device, cuda.GpuPasses | cuda_vectors.GpuVectorPasses] = {}
+        self._devices: dict[torch.device, cuda.DevicePasses] = {}
         self._enter()
 
     def _enter(self) -> None:
@@ -75,7 +75,7 @@ class Engine:
 
         return PlanePasses(self.tables)
 
-    def on(self, device: torch.device) -> cuda.GpuPasses | cuda_vectors.GpuVectorPasses:
+    def on(self, device: torch.device) -> cuda.DevicePasses:
         """The Triton passes, with their tables on ``device``."""
         if device in self._devices:
             return self._devices[device]
@@ -147,9 +147,7 @@ class Engine:
             return cuda_vectors.workspace(self.tables, _vector_limits(), batch, itemsize)
         return cuda.workspace(self.tables, batch, itemsize)
 
-    def _trusted_on(
-        self, device: torch.device, dtype: torch.dtype
-    ) -> cuda.GpuPasses | cuda_vectors.GpuVectorPasses:
+    def _trusted_on(self, device: torch.device, dtype: torch.dtype) -> cuda.DevicePasses:
         """The passes on a device, once they have reproduced the CPU's there.
 
         Raises:

@@ -26,6 +26,8 @@ from torchpcct.vector_geometry import VectorGeometry, split_motion
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+    from torchpcct.typing import Floats
+
 
 LAYER_SHIFT = 0.04
 """Row edges may move by this part of the blur between two depth layers (see layer_spacing)."""
@@ -106,6 +108,14 @@ class Tables:
         # Of all rows, whichever the window keeps: a reading must not depend on what else is read.
         rows = self.geometry.shape[1]
         return layer_spacing(self.pose, self.grid, self.rays.row_edge, self.rays.row_pitch, rows)
+
+
+def along_xyz(grid: VolumeGrid) -> tuple[NDArray[np.int64], Floats, Floats]:
+    """Voxels, spacing and centre in mm of a grid along x, y and z; a plane is one slice of 1 mm."""
+    spacing, center = (
+        np.array([*v[::-1], w])[:3] for v, w in ((grid.spacing, 1.0), (grid.center, 0.0))
+    )
+    return np.array([*grid.shape[::-1], 1], dtype=np.int64)[:3], spacing, center
 
 
 class VectorTables:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from torchpcct.geometry import VolumeGrid
 from torchpcct.projector.cpu.vector_kernels import SLAB_BLOCK, backproject_vectors, project_vectors
-from torchpcct.projector.tables import VectorTables
+from torchpcct.projector.tables import VectorTables, along_xyz
 from torchpcct.threads import run
 
 Floats = NDArray[np.float64]
@@ -37,12 +37,8 @@ class PosePasses:
         middle: float | None = None,
     ) -> None:
         self.grid, self.readings = grid, readings
-        nx, ny = grid.shape[-1], grid.shape[-2]
-        nz = grid.shape[0] if grid.ndim == 3 else 1
-        spacing, center = (
-            np.array([*v[::-1], w])[:3] for v, w in ((grid.spacing, 1.0), (grid.center, 0.0))
-        )
-        shape = np.array([nx, ny, nz], dtype=np.int64)
+        shape, spacing, center = along_xyz(grid)
+        nx, ny = int(shape[0]), int(shape[1])
         lower = center - shape * spacing / 2
         strides = np.array([1, nx, nx * ny], dtype=np.int64)
         row = (readings[1] - 1) / 2 if middle is None else float(middle)

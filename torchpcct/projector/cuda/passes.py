@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -21,7 +22,33 @@ _STEPS = 2
 """Steps of a segment's look-up table for each of its columns."""
 
 
-class GpuPasses:
+class DevicePasses(ABC):
+    """Passes of a scan on one device.
+
+    Attributes:
+        device: where the tables live and the passes run.
+    """
+
+    device: torch.device
+
+    @abstractmethod
+    def forward(self, x: Tensor) -> Tensor:
+        """``(batch, *domain_shape)`` to ``(batch, *range_shape)``."""
+
+    @abstractmethod
+    def adjoint(self, y: Tensor) -> Tensor:
+        """``(batch, *range_shape)`` to ``(batch, *domain_shape)``."""
+
+    def _budget(self) -> int | None:
+        """Bytes of working memory allowed, None for no limit."""
+        return (
+            int(torch.cuda.mem_get_info(self.device)[0]) // 2
+            if self.device.type == "cuda"
+            else None
+        )
+
+
+class GpuPasses(DevicePasses):
     """Forward and adjoint passes of a scan on one device (any device under the Triton interpreter).
 
     Args:
@@ -101,14 +128,6 @@ class GpuPasses:
     def _shape(self) -> tuple[int, int, int]:
         nz, ny, nx = (1, *self.tables.grid.shape) if self.plane else self.tables.grid.shape
         return nz, ny, nx
-
-    def _budget(self) -> int | None:
-        """Bytes of working memory allowed, None for no limit."""
-        return (
-            int(torch.cuda.mem_get_info(self.device)[0]) // 2
-            if self.device.type == "cuda"
-            else None
-        )
 
     def forward(self, x: Tensor) -> Tensor:
         """``(batch, *domain_shape)`` to ``(batch, *range_shape)``."""

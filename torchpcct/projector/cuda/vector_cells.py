@@ -11,10 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpcct.projector.tables import VectorTables
+from torchpcct.projector.tables import VectorTables, along_xyz
 
 if TYPE_CHECKING:
     from torchpcct.typing import Floats
+
+
+ORDER = np.array([[0, 2, 1], [1, 2, 0], [2, 1, 0]])
+"""Of each main axis itself, a and b: 0 x, 1 y, 2 z."""
 
 
 class Limits(NamedTuple):
@@ -92,18 +96,14 @@ class VectorCells:
         g, grid = tables.geometry, tables.grid
         self.limits, self.parallel, self.device = limits, g.parallel, device
         self.views, self.rows, self.columns = g.views, g.rows or 1, g.columns
-        spacing, center = (
-            np.array([*v[::-1], w])[:3] for v, w in ((grid.spacing, 1.0), (grid.center, 0.0))
-        )
-        self.shape = np.array([*grid.shape[::-1], 1])[:3]
+        self.shape, spacing, center = along_xyz(grid)
         lower = center - self.shape * spacing / 2
         poses = np.array(g.poses)
         if grid.ndim == 2:
             poses[:, 3] = 0.0  # cells without height read the slice itself
         self._poses = torch.from_numpy(poses).to(device)
         # By main axis, of (main axis, a, b): spacing, lower edge, voxels.
-        order = np.array([[0, 2, 1], [1, 2, 0], [2, 1, 0]])
-        about = np.concatenate([spacing[order], lower[order], self.shape[order]], axis=1)
+        about = np.concatenate([spacing[ORDER], lower[ORDER], self.shape[ORDER]], axis=1)
         self._about = torch.from_numpy(np.ascontiguousarray(about.T)).to(device)
         self._spacing = spacing.tolist()
 

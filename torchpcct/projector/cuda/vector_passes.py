@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpcct.projector.cuda.passes import LANES
-from torchpcct.projector.cuda.vector_cells import Limits, VectorCells, bits_of
-from torchpcct.projector.tables import VectorTables
+from torchpcct.projector.cuda.passes import LANES, DevicePasses
+from torchpcct.projector.cuda.vector_cells import ORDER, Limits, VectorCells, bits_of
+from torchpcct.projector.tables import VectorTables, along_xyz
 
 if TYPE_CHECKING:
     from torchpcct.typing import Floats
@@ -30,7 +30,7 @@ _ROUNDING = 32
 """Of numbers that are sums of a few: at most so many units of their last place."""
 
 
-class GpuVectorPasses:
+class GpuVectorPasses(DevicePasses):
     """Forward and adjoint passes of a scan given by vectors on one device (any device under the
     Triton interpreter).
 
@@ -51,23 +51,13 @@ class GpuVectorPasses:
         # A ray moves by a voxel a slab at most: what is further away passes by.
         self.bound = 2.0 * int(shape.max()) + self.survey.reach + 8.0
         self.bits = bits_of(self.bound + int(shape.max()))
-        view, axis = np.nonzero(self.survey.widest[..., 0] >= 0)
-        self._entry_views = view
-        entries = np.stack([view, axis], 1).astype(np.int32)
-        self.entries = torch.from_numpy(entries).to(device)
+        self._entries = np.argwhere(self.survey.widest[..., 0] >= 0)
+        self.entries = torch.from_numpy(self._entries.astype(np.int32, order="C")).to(device)
         self._sent: dict[torch.dtype, tuple[Tensor, Tensor]] = {}
 
     @property
     def _readings(self) -> int:
         return self.cells.rows * self.cells.columns
-
-    def _budget(self) -> int | None:
-        """Bytes of working memory allowed, None for no limit."""
-        return (
-            int(torch.cuda.mem_get_info(self.device)[0]) // 2
-            if self.device.type == "cuda"
-            else None
-        )
 
     def _of(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Numbers and projections in a dtype."""
@@ -95,14 +85,10 @@ class GpuVectorPasses:
         widest cell along a and b, see :class:`Survey`; the source's slab; what rounding does to the
         three; margins in columns and rows.
         """
-        cells, grid = self.cells, self.tables.grid
-        spacing, center = (
-            np.array([*v[::-1], w])[:3] for v, w in ((grid.spacing, 1.0), (grid.center, 0.0))
-        )
-        order = np.array([[0, 2, 1], [1, 2, 0], [2, 1, 0]])
-        entries = np.nonzero(self.survey.widest[..., 0] >= 0)
-        out = np.zeros((len(entries[0]), 20))
-        for at, (view, axis) in enumerate(zip(*entries, strict=True)):
+        cells = self.cells
+        _, spacing, center = along_xyz(self.tables.grid)
+        out = np.zeros((len(self._entries), 20))
+        for at, (view, axis) in enumerate(self._entries):
             source, detector, u, v = self.tables.geometry.poses[view]
             ray, origin = (source, detector) if self.parallel else (detector - source, source)
             inverse = np.linalg.inv(np.stack([u, v, ray], 1))
@@ -111,10 +97,10 @@ class GpuVectorPasses:
                 found[2] = 1.0, 0.0, 0.0, 0.0
             for k, cells_along in enumerate((cells.columns, cells.rows)):
                 found[k] += (cells_along - 1) / 2 * found[2]
-            found = found[:, [0, *(1 + order[axis])]]
+            found = found[:, [0, *(1 + ORDER[axis])]]
             if self.plane:
                 found[:, 2] = 0.0
-            reach = np.array([1.0, *((cells.shape[order[axis]] + 1) / 2)])
+            reach = np.array([1.0, *((cells.shape[ORDER[axis]] + 1) / 2)])
             size = np.abs(found) @ reach
             size[:2] += size[2] * (np.array([cells.columns, cells.rows]) + 1.0)
             split = self.survey.split[view, :2]
@@ -177,7 +163,7 @@ class GpuVectorPasses:
         numbers, projections = self._of(y.dtype)
         for begin, stop in self._chunks():
             table = cells.table(begin, stop, self.bits, self.bound, self.survey, y.dtype)
-            first, last = np.searchsorted(self._entry_views, [begin, stop]).tolist()
+            first, last = np.searchsorted(self._entries[:, 0], [begin, stop]).tolist()
             kernels.backproject_vectors[(math.ceil(nx * ny * nz / self.lanes), batch)](
                 data,
                 out,
