@@ -148,7 +148,9 @@ class Volume:
                 file.create_dataset(f"maps/{name}", data=values.detach().cpu().numpy())
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], unit: str | None = None) -> Volume:
+    def load(
+        cls, path: str | os.PathLike[str], unit: str | None = None, *, fill: float | None = None
+    ) -> Volume:
         """Read a volume of any format that :meth:`save` writes, or one DICOM image (``.dcm``,
         ``.ima``, no ending).
 
@@ -158,11 +160,14 @@ class Volume:
             path: file or folder.
             unit: of its numbers, for files of other software, which do not say it: None: HU, and of
                 DICOM only what is said to be HU.
+            fill: number that takes the place of voxels that are NaN or infinite, e.g. −1000 HU
+                where they are padding about the picture; NaN: they stay as they are; None: such a
+                volume is refused.
 
         Raises:
             FileNotFoundError: no such file or folder.
             ValueError: an unknown ending; a file that is damaged, foreign, oblique or incomplete,
-                or says another unit.
+                says another unit, or holds voxels that are NaN or infinite.
             ImportError: the package that reads the format is not installed.
         """
         if unit is not None:
@@ -176,7 +181,8 @@ class Volume:
                 "OME-Zarr": read_ome_zarr,
             }[form]
             values, grid, stored = read(path, unit)
-            return cls(torch.from_numpy(values), grid, {"file": str(path)}, stored)
+            data = _finite(torch.from_numpy(values), path, stored, fill)
+            return cls(data, grid, {"file": str(path)}, stored)
         with read_hdf5(path, "volume") as file:
             held = file["data"]
             check_expansion(held.shape, "the volume", held.id.get_storage_size, held.dtype.itemsize)
@@ -193,4 +199,28 @@ class Volume:
             report |= {
                 name: torch.from_numpy(values[()]) for name, values in file.get("maps", {}).items()
             }
-            return cls(data, grid, report, stored)
+            return cls(_finite(data, path, stored, fill), grid, report, stored)
+
+
+def _finite(data: Tensor, path: str | os.PathLike[str], unit: str, fill: float | None) -> Tensor:
+    """The voxels of a file, those that are NaN or infinite replaced by ``fill``, as in
+    :meth:`Volume.load`.
+
+    Raises:
+        ValueError: there are such voxels, and nothing to put in their place.
+    """
+    # Any one of them, or an overflow, shows in the sum, which takes no memory.
+    if math.isfinite(float(data.sum())):
+        return data
+    finite = torch.isfinite(data)
+    bad = data.numel() - int(finite.sum())
+    if fill is None and bad:
+        air = -1000.0 if unit == "HU" else 0.0
+        raise ValueError(
+            f"{path}: {bad} of {data.numel()} voxels are NaN or infinite: make it again or, where "
+            f"they are padding about the picture, give them the value of air, "
+            f"Volume.load(path, fill={air:g}).save(path)"
+        )
+    if fill is not None and not math.isnan(fill):
+        data[~finite] = fill
+    return data

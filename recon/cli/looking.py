@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -60,8 +61,10 @@ def _is_volume(path: Path) -> bool:
 
 def _is_dicom(path: Path) -> bool:
     """Whether a file is DICOM, by its ending or, without one, by its beginning."""
+    from torchpcct.formats.dicom_series import DICOM_ENDINGS
+
     if path.suffix or not path.is_file():
-        return path.suffix.lower() in (".dcm", ".ima") and path.is_file()
+        return path.suffix.lower() in DICOM_ENDINGS and path.is_file()
     with path.open("rb") as file:
         return file.read(132)[128:] == b"DICM"
 
@@ -76,8 +79,12 @@ def _info(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 
     path: Path = arguments.file
     if _is_volume(path):
-        volume = Volume.load(path)
+        # Looked at, a volume may hold anything; what computes with it refuses what is not finite.
+        volume = Volume.load(path, fill=math.nan)
         values, length = volume.data.double(), length_of(volume.unit)
+        finite = values.isfinite()
+        bad = values.numel() - int(finite.sum())
+        values = values[finite] if 0 < bad < values.numel() else values
         about: dict[str, object] = {
             "kind": "volume",
             "shape": list(volume.grid.shape),
@@ -87,6 +94,7 @@ def _info(arguments: argparse.Namespace, progress: ProgressBars) -> None:
             "lowest": float(values.min()),
             "mean": float(values.mean()),
             "highest": float(values.max()),
+            **({"voxels_not_finite": bad} if bad else {}),
             "report": dict(volume.report),
         }
     else:
@@ -168,7 +176,10 @@ def _view(arguments: argparse.Namespace, progress: ProgressBars) -> None:
 
     changes = [map_beside(file) for file in files] if page else []
     files = [*files, *(path for path in changes if path.exists() and path not in files)]
-    volumes = [Volume.load(file) for file in files]
+    volumes = [Volume.load(file, fill=math.nan) for file in files]
+    for file, volume in zip(files, volumes, strict=True):
+        if not bool(volume.data.isfinite().any()):
+            raise ValueError(f"{file} holds no finite value")
     scales = [
         _SCALE_OF_CHANGES
         if file in changes
@@ -250,7 +261,9 @@ def _grey_scale(values: Tensor, level: float | None, window: float | None) -> tu
     anything else."""
     import numpy as np
 
-    low, high = np.quantile(values[..., :: max(1, values.numel() // 2**22)].numpy(), [0.001, 0.999])
+    some = values[..., :: max(1, values.numel() // 2**22)]
+    some = some[some.isfinite()] if bool(some.isfinite().any()) else values[values.isfinite()]
+    low, high = np.quantile(some.numpy(), [0.001, 0.999])
     hu = high - low > _LEAST_HU
     if level is None:
         level = 40.0 if hu else float(low + high) / 2

@@ -423,7 +423,12 @@ def _split(name: str, pair: Sequence[object]) -> HalfSplit:
             f"{name}: two volumes (z, y, x) of one shape are needed, got {first.shape} and "
             f"{second.shape}"
         )
-    if not (torch.isfinite(first).all() and torch.isfinite(second).all()):
-        raise ValueError(f"{name}: a volume holds NaN or Inf")
+    for volume in (first, second):
+        bad = int((~torch.isfinite(volume)).sum())
+        if bad:
+            raise ValueError(
+                f"{name}: {bad} of {volume.numel()} voxels of a volume are NaN or infinite: make "
+                "it again or, where they are padding about the picture, give them the value of air"
+            )
     shape = (1, *first.shape)[-3:]
     return HalfSplit(first.reshape(shape), second.reshape(shape))

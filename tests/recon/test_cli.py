@@ -242,6 +242,15 @@ def test_names_and_grey_scale_of_their_own(here, cli):
     assert "level 40, window 400" in cli("view series")
     assert "kind: volume" in cli("info series")
     assert sorted(p.name for p in here.glob("*.png")) == ["series.png", "small.png"]
+    # What only looks at a volume shows one with holes, too.
+    ramp[0, 0] = torch.nan
+    Volume(ramp, VolumeGrid((3, 4, 4), 1.0), unit="mm^-1").save("holes.nii")
+    about = json.loads(cli("info holes.nii --json"))
+    assert about["voxels_not_finite"] == 4
+    assert about["highest"] == pytest.approx(0.2)
+    assert "level 0.1" in cli("view holes.nii")
+    Volume(ramp * torch.nan, VolumeGrid((3, 4, 4), 1.0), unit="mm^-1").save("none.nii")
+    assert "none.nii holds no finite value" in cli("view none.nii", 2)
 
 
 def test_a_lower_dose_of_a_scan_file(here, cli):

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 
-DICOM_ENDINGS = (".dcm", ".ima")
+DICOM_ENDINGS = (".dcm", ".ima", ".dicom", ".dic")
 """Of files that are DICOM whatever is in them."""
 _PREAMBLE = 128
 """Bytes before a DICOM file's mark."""

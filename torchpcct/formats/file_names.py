@@ -18,14 +18,17 @@ _CHAIN = re.compile(r"\d+\.\d+\.\d+")
 """Sections, dates or identifiers rather than decimals."""
 _SHOWN = 4
 """File names that a message lists at most."""
+_ONE_KIND = (("tif", "tiff"), ("yaml", "yml"), ("h5", "hdf5", "hdf"), ("nxs", "nx", "nx5"))
+"""Endings in small letters that name one format."""
 
 
 def matching(pattern: str, folder: Path) -> list[Path]:
     """Files that a name or pattern means, in the order of the numbers in their names.
 
-    A pattern may be an absolute path, and its ending may differ from the files' in capitals
-    (``.TIF``). Hidden files (``._1.tif`` of a Mac) are left out, as a shell does. A file that is
-    called like the pattern itself is that file.
+    A pattern may be an absolute path, and its ending may be another one of the same format
+    (``.TIF``, ``.tiff`` and ``.TIFF`` for ``.tif``), unless it holds brackets (``*.ti[f]``). Hidden
+    files (``._1.tif`` of a Mac) are left out, as a shell does. A file that is called like the
+    pattern itself is that file.
 
     Args:
         pattern: ``*``, ``?``, ``[...]`` and ``**`` as in a shell.
@@ -33,17 +36,44 @@ def matching(pattern: str, folder: Path) -> list[Path]:
 
     Raises:
         FileNotFoundError: no file.
+        ValueError: two files that differ in such endings alone, one image twice.
     """
     if not glob.has_magic(pattern) or (folder / pattern).exists():
         return [folder / pattern]
-    stem, point, ending = pattern.rpartition(".")
-    any_case = "".join(f"[{c.lower()}{c.upper()}]" for c in ending)
-    wanted = f"{stem}.{any_case}" if point and ending.isalpha() else pattern
-    found = [folder / name for name in glob.glob(wanted, root_dir=folder, recursive=True)]
-    files = [path for path in found if not path.is_dir() or path.suffix.lower() == ".zarr"]
+    found = {
+        folder / name
+        for wanted in _with_its_endings(pattern)
+        for name in glob.glob(wanted, root_dir=folder, recursive=True)
+    }
+    files = sorted(path for path in found if not path.is_dir() or path.suffix.lower() == ".zarr")
     if not files:
         raise FileNotFoundError(f"no file matches {folder / pattern}")
+    stems: dict[tuple[Path, tuple[str, ...]], Path] = {}
+    for path in files:
+        other = stems.setdefault((path.with_suffix(""), _kind(path.suffix[1:])), path)
+        if other is not path:
+            raise ValueError(
+                f"{other} and {path.name} both match {pattern}, one image twice: leave one of them "
+                f"there, or put a letter of the ending in brackets, as {pattern[:-1]}"
+                f"[{pattern[-1]}], to mean it alone"
+            )
     return in_number_order(files)
+
+
+def _kind(ending: str) -> tuple[str, ...]:
+    """All endings of the format that one names, without the dot."""
+    return next((kind for kind in _ONE_KIND if ending.lower() in kind), (ending.lower(),))
+
+
+def _with_its_endings(pattern: str) -> list[str]:
+    """Patterns that find the same names with any ending of the same format, in any capitals."""
+    stem, point, ending = pattern.rpartition(".")
+    if not point or not ending or set(ending) & set("[]/\\"):
+        return [pattern]
+    return [
+        f"{stem}." + "".join(f"[{c}{c.upper()}]" if c.isalpha() else c for c in each)
+        for each in _kind(ending)
+    ]
 
 
 def in_number_order(paths: Sequence[Path]) -> list[Path]:

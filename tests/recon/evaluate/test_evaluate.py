@@ -365,6 +365,21 @@ def test_two_volumes_of_one_name_are_refused(tmp_path):
         volume_files(tmp_path)
 
 
+def test_volumes_with_voxels_that_are_no_numbers_are_named(here, cli):
+    data, grid = torch.zeros(4, 8, 8), VolumeGrid((4, 8, 8), 1.0)
+    data[0, :2] = torch.nan
+    for folder in ("one", "two"):
+        (here / folder).mkdir()
+        Volume(data, grid).save(here / folder / "fbp.nii.gz")
+    said = "one/fbp.nii.gz: 16 of 256 voxels are NaN or infinite: make it again or, "
+    assert said in cli("evaluate --volumes one two --out m", 2)
+    realisation = SimpleNamespace(label="insert/fbp", grid=grid)
+    with pytest.raises(ValueError, match=said):
+        method_of("files:one").run(realisation)
+    with pytest.raises(ValueError, match="mine: 16 of 256 voxels of a volume are NaN or infinite"):
+        evaluate_volumes({"mine": [data, data]}, [data.nan_to_num()] * 2, 1.0)
+
+
 @pytest.mark.extended
 def test_volumes_of_another_program(here, cli):
     """From --export to a report without renaming a file, by the commands of the how-to."""

@@ -86,11 +86,32 @@ def test_stacks_are_read_in_number_order_or_in_that_of_a_list(tmp_path):
     np.testing.assert_array_equal(stack(tmp_path / "b", names[::-1], names), READINGS[::-1, 0])
 
 
-@pytest.mark.parametrize("ending", [".TIF", ".Tif", ".tiff", ".TIFF"])
-def test_patterns_find_endings_in_capitals_and_leave_hidden_files(tmp_path, ending):
+@pytest.mark.parametrize("pattern", ["*.tif", "p*.tiff", "*.TIF", "*.TIFF", "*.tif*", "p??.ti?"])
+@pytest.mark.parametrize("ending", [".tif", ".TIF", ".Tif", ".tiff", ".TIFF"])
+def test_patterns_find_all_endings_of_a_format_and_leave_hidden_files(tmp_path, pattern, ending):
     names = [f"p{k:02d}{ending}" for k in range(12)]
     (tmp_path / "._p00.tif").write_bytes(b"\0\5\26\7")
-    np.testing.assert_array_equal(stack(tmp_path, f"*{ending.lower()}", names), READINGS[:, 0])
+    if pattern == "p??.ti?" and len(ending) == 5:
+        with pytest.raises(FileNotFoundError, match="no file matches"):
+            stack(tmp_path, pattern, names)
+    else:
+        np.testing.assert_array_equal(stack(tmp_path, pattern, names), READINGS[:, 0])
+
+
+def test_endings_of_one_format_may_mix_and_one_image_twice_is_refused(tmp_path):
+    names = [f"p{k:02d}{('.tif', '.TIFF', '.tiff', '.TIF')[k % 4]}" for k in range(12)]
+    np.testing.assert_array_equal(stack(tmp_path, "p*.tif", names), READINGS[:, 0])
+    (tmp_path / "p00.tiff").write_bytes((tmp_path / "p00.tif").read_bytes())
+    with pytest.raises(
+        ValueError,
+        match=r"p00\.tif and p00\.tiff both match p\*\.tif, one image .* as p\*\.ti\[f\],",
+    ):
+        matching("p*.tif", tmp_path)
+    assert [p.name for p in matching("p*.ti[f]", tmp_path)] == ["p00.tif", "p04.tif", "p08.tif"]
+    # Beside them, files of other formats with the same names, which the pattern does not mean.
+    (tmp_path / "p00.tiff").unlink()
+    (tmp_path / "p00.txt").touch()
+    assert [p.name for p in matching("p*.tif", tmp_path)] == names
 
 
 def test_a_pattern_may_be_absolute_and_its_folder_may_hold_brackets(tmp_path):

@@ -415,6 +415,39 @@ def test_padding_about_the_picture_is_air_and_said(series, value, change, inside
     assert torch.equal(data.flip(1, 2), expected)
 
 
+def _in_floats(d):
+    """Pixels as DICOM's parametric maps hold them."""
+    pixels = d.pixel_array.astype("<f4")
+    pixels[1, 2] = np.nan
+    del d.PixelData
+    d.FloatPixelData, d.BitsAllocated = pixels.tobytes(), 32
+    del d.BitsStored, d.HighBit, d.PixelRepresentation
+
+
+@pytest.mark.parametrize("name", [*NAMES, "v.zarr"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_voxels_that_are_no_numbers_are_refused_or_filled(tmp_path, series, name, value):
+    """By every reader: they would be in each figure, or left out of it without a word."""
+    path = series(_in_floats) if name == "series" else tmp_path / name
+    data, bad = DATA.clone(), 4
+    if name != "series":
+        data[1:3, 2, 1], data[0, 0, 0], bad = value, value, 3
+        Volume(data, GRID).save(path)
+    said = (
+        f"{re.escape(str(path))}: {bad} of 120 voxels are NaN or infinite: make it again .* give "
+        r"them the value of air, Volume\.load\(path, fill=-1000\)\.save\(path\)"
+    )
+    with pytest.raises(ValueError, match=said):
+        Volume.load(path)
+    filled = Volume.load(path, fill=-1000.0).data
+    assert bool(filled.isfinite().all())
+    kept = Volume.load(path, fill=np.nan).data
+    assert int((~kept.isfinite()).sum()) == bad
+    assert torch.equal(filled, torch.where(kept.isfinite(), kept, torch.full_like(kept, -1000.0)))
+    if name != "series":
+        assert torch.equal(kept[1:3, 2, 1].isnan(), torch.tensor([np.isnan(value)] * 2))
+
+
 def test_padding_in_all_corners_that_nothing_marks(series):
     def corners(d):
         pixels = d.pixel_array.copy()
