@@ -181,7 +181,7 @@ def calibrate(
     if not isinstance(scan, Scan):
         raise TypeError(f"scan must be a Scan, got {type(scan).__name__}")
     names = _names(scan, free)
-    problem = _Problem(scan, grid, names)
+    problem = _CalibrationProblem(scan, grid, names)
     tell = progress or (lambda _: None)
     values = problem.start()
     before = 0.0
@@ -275,7 +275,7 @@ class _State:
     misfit: float
 
 
-class _Problem:
+class _CalibrationProblem:
     """The readings of a scan, and what volumes on a grid leave of them."""
 
     def __init__(self, scan: Scan, grid: VolumeGrid, names: list[str]) -> None:

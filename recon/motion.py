@@ -142,7 +142,7 @@ _FLOOR_MM = 0.01
 likely the cause, and a prior that the readings chose themselves says too little of its error."""
 _LEFT_MODEL = 0.0012
 """What errors of the model leave of the smoothed readings, mean square in units of their noise's
-variance, over :attr:`_Problem.signal`; of the paper's plaque, at rest."""
+variance, over :attr:`_MotionProblem.signal`; of the paper's plaque, at rest."""
 _ANOTHER = 3.0
 """Times that, beside what noise leaves, from which on something else moves."""
 _CHANCE = 1.05
@@ -230,7 +230,7 @@ class InsetMotion:
         }
 
 
-class _Problem:
+class _MotionProblem:
     """The readings of an inset, and what volumes that move leave of them.
 
     Attributes:
@@ -395,7 +395,7 @@ class _Problem:
         found = self._averaging[view:].any(0).astype(np.float64)
         return found - found.mean()
 
-    def with_jump(self, view: int) -> _Problem:
+    def with_jump(self, view: int) -> _MotionProblem:
         """The same readings, of paths that may jump at an averaged view, too."""
         found = copy.copy(self)
         found.jump = view
@@ -680,7 +680,7 @@ def estimate_motion(
         TypeError: no :class:`torchpcct.Scan`.
     """
     _require_inset(scan)
-    problem = _Problem(scan, grid, _beats(scan, heart_rate, rotation_s))
+    problem = _MotionProblem(scan, grid, _beats(scan, heart_rate, rotation_s))
     tell = progress or (lambda _: None)
     rest, quiet = problem.misfits()
     found = _followed(problem, problem.start(), tell)
@@ -746,7 +746,7 @@ class _Found:
         steps: iterations done.
     """
 
-    problem: _Problem
+    problem: _MotionProblem
     before: Floats
     coefficients: Floats
     belief: _Belief
@@ -776,7 +776,10 @@ class _Found:
 
 
 def _followed(
-    problem: _Problem, at: Floats, tell: Callable[[float], None] = lambda _: None, before: int = 0
+    problem: _MotionProblem,
+    at: Floats,
+    tell: Callable[[float], None] = lambda _: None,
+    before: int = 0,
 ) -> _Found | None:
     """Gauss and Newton's iterations from coefficients; None: the inset shows nothing.
 
@@ -845,7 +848,7 @@ def _likeliest(found: _Found, views: Sequence[int]) -> tuple[float, int]:
     return float(gains.max()), views[int(gains.argmax())]
 
 
-def _none(problem: _Problem, left: float) -> InsetMotion:
+def _none(problem: _MotionProblem, left: float) -> InsetMotion:
     """Nothing is seen in the inset, so nothing of it is seen to move."""
     nowhere = np.zeros((len(problem.basis), 3))
     text = "the inset shows nothing above its noise whose motion could be found; none is applied"

@@ -43,7 +43,7 @@ from recon.least_squares.qggmrf import QGGMRF
 from recon.metal import metal_warnings
 from recon.names import METHODS
 from torchpcct.checks.defects import (
-    Cells,
+    DefectiveCells,
     cell_sums,
     dark_views,
     is_repaired,
@@ -148,7 +148,7 @@ class ScanSlices:
                 ".h5 of it"
             )
         self.source, self.options = scan, options
-        self.cells: Cells | None = None
+        self.cells: DefectiveCells | None = None
         self.photon: float | None = None
         try:
             self.first = self._open(0, 4)
@@ -199,7 +199,7 @@ class ScanSlices:
         cells = (
             None
             if self.cells is None
-            else Cells(
+            else DefectiveCells(
                 self.cells.views, *(c[low : low + raw.geometry.rows] for c in self.cells[1:])
             )
         )

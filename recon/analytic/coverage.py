@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,8 +18,10 @@ from torchpcct.angles import OPEN_GAP_STEPS, SAME_VIEW, is_offset
 from torchpcct.checks.defects import BRIGHT
 from torchpcct.detector_window import footprint
 from torchpcct.geometry import (
+    Beam,
     ConeBeam,
     Geometry,
+    ParallelBeam,
     VolumeGrid,
     beam,
     project_points,
@@ -301,7 +303,7 @@ def consistency_warnings(scan: Scan, grid: VolumeGrid, motion: Floats | None = N
     return [*found, *few]
 
 
-def _at_rest(lines: Tensor, geometry: Any, about: tuple[float, float], motion: Floats) -> Tensor:
+def _at_rest(lines: Tensor, geometry: Beam, about: tuple[float, float], motion: Floats) -> Tensor:
     """Readings ``(views, [rows,] columns)`` of what moves, its exterior taken off, moved to where
     they would be at rest, between columns and rows; beyond the window stands its border's value.
 
@@ -337,7 +339,7 @@ def _shifted(values: Tensor, shift: Tensor, axis: int) -> Tensor:
     return torch.lerp(near, moved.gather(-1, (index + 1).clamp(max=last)), share).movedim(-1, axis)
 
 
-def _unmeasured_texts(lines: Tensor, geometry: Any, grid: VolumeGrid) -> list[str]:
+def _unmeasured_texts(lines: Tensor, geometry: Beam, grid: VolumeGrid) -> list[str]:
     """Lines through the object and the grid that no view measured, of a cone beam in the plane of
     the source: FBP refuses an arc below half a turn and the detector's fan, an iterative method
     takes it, and needs half a turn and the object's.
@@ -366,11 +368,11 @@ def _unmeasured_texts(lines: Tensor, geometry: Any, grid: VolumeGrid) -> list[st
 
 
 @lru_cache(maxsize=16)
-def _gaps(geometry: Any) -> Floats:
+def _gaps(geometry: Beam) -> Floats:
     """Largest angle between directions next to each other in which the lines of each column are
     measured, ``(columns,)`` rad."""
     t = geometry.ray_distances
-    fan = np.zeros_like(t) if geometry.parallel else geometry.fan_angles
+    fan = np.zeros_like(t) if isinstance(geometry, ParallelBeam) else geometry.fan_angles
     found = np.zeros(t.size)
     for column in range(t.size):
         directions = [geometry.angles - fan[column]]

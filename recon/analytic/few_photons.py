@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from scipy.ndimage import uniform_filter
 from torch import Tensor
 
 from recon.analytic.water_unit import row_image
 from torchpcct.checks.logarithm import logarithm_error
+from torchpcct.geometry import Beam
 from torchpcct.scan import Scan
 
 TOLERANCE = 0.015
@@ -21,7 +20,7 @@ _OBJECT = 0.4
 """Attenuation over the object's highest, of regions, from which a place is inside."""
 
 
-def bias_warnings(scan: Scan, lines: Tensor, geometry: Any) -> list[str]:
+def bias_warnings(scan: Scan, lines: Tensor, geometry: Beam) -> list[str]:
     """How far filtered backprojection is off where logarithms are of few photons.
 
     Args:

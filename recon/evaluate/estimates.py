@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.evaluate.measure import OBSERVERS, Readings
+from recon.evaluate.measure import OBSERVERS, RoiReadings
 from recon.evaluate.task import GroundTruth
 from torchpcct.metrics.control import controlled_log_variance, controlled_mean
 from torchpcct.metrics.intervals import Estimate, Jackknifed, combined, log_of_sum
@@ -113,7 +113,7 @@ class _Figures:
 
     def __init__(
         self,
-        readings: Readings,
+        readings: RoiReadings,
         true: Floats,
         absent: Floats,
         reference: ReferenceNoise,
@@ -261,8 +261,8 @@ def records_of(
     task: str,
     method: str,
     exposure_s: float,
-    readings: Readings,
-    base: Readings,
+    readings: RoiReadings,
+    base: RoiReadings,
     reference: ReferenceNoise,
     ground_truth: GroundTruth,
     true: Floats,

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from recon.evaluate.energies import BINS, EnergyRealisations, with_bins
 from recon.evaluate.estimates import Record, ReferenceNoise, records_of
-from recon.evaluate.measure import BLOCK, Measurement, Reader, Readings, kept_as
+from recon.evaluate.measure import BLOCK, Measurement, Reader, RoiReadings, kept_as
 from recon.evaluate.methods import Method, MethodLike, listed, method_of
 from recon.evaluate.realisations import Realisations, Simulated
 from recon.evaluate.task import GroundTruth, Task
@@ -416,7 +416,7 @@ class _Bench:
             if k:
                 measurement.block(k, partial(pairs, self.methods[name].energies))
 
-    def readings(self, name: str, exposure: float, n: int) -> Readings:
+    def readings(self, name: str, exposure: float, n: int) -> RoiReadings:
         """Of a method at an exposure, from its pieces; one that cannot be read is computed."""
         measurement = self.measurement(name, exposure)
         for k in _blocks(n):

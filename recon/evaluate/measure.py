@@ -60,7 +60,7 @@ _FEWEST = 50
 
 
 @dataclass(frozen=True, eq=False)
-class Readings:
+class RoiReadings:
     """Of one method at one exposure; the first axis is the realisation, the second says with or
     without the signal.
 
@@ -320,7 +320,7 @@ class Measurement:
             self.store.piece(f"{self._place}/{k.start}-{k.stop}", self._key, compute)
         )
 
-    def readings(self) -> Readings:
+    def readings(self) -> RoiReadings:
         """Of all blocks."""
         pieces, clean, known = self._pieces, self._clean, self._known
         joined = {
@@ -331,7 +331,7 @@ class Measurement:
         known_moments = (
             None if known is None else (joined["control"], known["mean"], known["covariance"])
         )
-        return Readings(
+        return RoiReadings(
             rois=joined["rois"],
             channels={o: joined[f"channels_{o}"] for o in OBSERVERS},
             square=joined["square"],

@@ -37,7 +37,7 @@ _SIGMA_SEEDS = (900_001, 900_002)
 """Realisations that a denoiser's noise level is measured on; none of them is evaluated."""
 
 
-class _Reader(Protocol):
+class _VolumeReader(Protocol):
     """What is read of volumes, as :class:`recon.evaluate.measure.Reader` does."""
 
     @property
@@ -131,7 +131,7 @@ class Realisations:
         }
 
     def response(
-        self, network: Mbir, reader: _Reader, exposure_s: float
+        self, network: Mbir, reader: _VolumeReader, exposure_s: float
     ) -> dict[str, NDArray[np.float64]]:
         """``adjoints`` ``(2 · rois, z, y, x)`` of MBIR's ROI means, ``mean`` and ``covariance``
         of what they give."""

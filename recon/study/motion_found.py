@@ -26,7 +26,7 @@ from torchpcct.scene.plaque import Plaque, plaque_scene
 if TYPE_CHECKING:
     from torchpcct.typing import JsonObject
 
-__all__ = ["CASES", "AlongAxis", "Jump", "found_paths", "motion_or_refusal"]
+__all__ = ["CASES", "AlongAxis", "JumpMotion", "found_paths", "motion_or_refusal"]
 
 _SECOND_MM = (-3.3, 0.0)
 """Where the second vessel lies beside the plaque's, x and y, on the side away from the plaque."""
@@ -67,7 +67,7 @@ class AlongAxis(SinusoidalMotion):
 
 
 @dataclass(frozen=True)
-class Jump(SinusoidalMotion):
+class JumpMotion(SinusoidalMotion):
     """All of the displacement at once.
 
     Args:
@@ -94,7 +94,7 @@ CASES: Mapping[str, Callable[[float, float], tuple[SinusoidalMotion, ...]]] = {
         _sine("wall", mm, rate, 0.6),
         _sine("wall", 0.5 * mm, rate, 0.6 + math.pi / 2, math.pi / 2),
     ),
-    "jump along x": lambda mm, rate: (Jump("wall", mm, rate),),
+    "jump along x": lambda mm, rate: (JumpMotion("wall", mm, rate),),
     "two vessels, alike": lambda mm, rate: tuple(
         _sine(body, mm, rate, math.pi / 2) for body in ("wall", "second")
     ),

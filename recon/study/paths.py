@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from recon.api import reconstruct
 from recon.jobs.store import Pieces, Step
 from recon.motion import InsetMotion
 from recon.study.figures import curve_axes
-from recon.study.motion_found import AlongAxis, Jump, motion_or_refusal
+from recon.study.motion_found import AlongAxis, JumpMotion, motion_or_refusal
 from recon.study.paper import facts as paper
 from recon.study.paper.plaque_scan import duty
 from recon.study.study import Measured, Progress, StudySettings, silent
@@ -58,7 +58,9 @@ _COVERED = 0.95
 """Share of a path within two standard errors, from which on the path counts as covered."""
 
 
-def _sine(rng: np.random.Generator, mm: float, rates: tuple[float, float], way: float) -> Any:
+def _sine(
+    rng: np.random.Generator, mm: float, rates: tuple[float, float], way: float
+) -> SinusoidalMotion:
     phase = rng.uniform(0.0, 2.0 * math.pi)
     return SinusoidalMotion(_BODY, mm, rng.uniform(*rates), phase, way)
 
@@ -83,7 +85,7 @@ def _loop(rng: np.random.Generator) -> Motions:
 def _jump(rng: np.random.Generator) -> Motions:
     mm, way = rng.uniform(0.2, 1.0), rng.uniform(0.0, 2.0 * math.pi)
     at = rng.uniform(0.15, 0.85) * paper.ROTATION_S
-    return (Jump(_BODY, mm, direction=way, at_s=at),)
+    return (JumpMotion(_BODY, mm, direction=way, at_s=at),)
 
 
 def _beat_and_jump(rng: np.random.Generator) -> Motions:
@@ -138,7 +140,7 @@ class PathsSettings(StudySettings):
 
 
 @dataclass
-class Seen:
+class Examples:
     """What the picture shows.
 
     Attributes:
@@ -197,7 +199,7 @@ def measure(
     settings: PathsSettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
     """Simulate, estimate and compare, in resumable pieces; more vessels go on where fewer ended."""
-    s, seen = settings, Seen()
+    s, seen = settings, Examples()
     pieces = _pieces(s, folder)
     rows: list[JsonObject] = []
     vessels = range(s.first, s.first + s.vessels)
@@ -205,7 +207,7 @@ def measure(
     for kind in s.kinds:
         for done, vessel in enumerate(vessels):
             truth, motions, found, seconds = _path(s, pieces, kind, vessel)
-            jump = next((m for m in motions if isinstance(m, Jump)), None)
+            jump = next((m for m in motions if isinstance(m, JumpMotion)), None)
             for exposure, one, cpu in zip(s.exposures_s, found, seconds, strict=True):
                 row = {"kind": kind, "vessel": vessel, "exposure_s": exposure, "cpu_seconds": cpu}
                 rows.append(row | compared(one, truth, jump))
@@ -287,7 +289,7 @@ def true_path(motions: Sequence[SinusoidalMotion], scan: Scan) -> Floats:
     return path - path.mean(0)
 
 
-def compared(found: InsetMotion | None, truth: Floats, jump: Jump | None) -> JsonObject:
+def compared(found: InsetMotion | None, truth: Floats, jump: JumpMotion | None) -> JsonObject:
     """One estimate, or none as it was refused, beside the truth.
 
     Returns:

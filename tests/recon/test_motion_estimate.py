@@ -15,8 +15,16 @@ import recon.motion
 from recon.analytic.coverage import _at_rest, consistency_warnings
 from recon.analytic.inset import InsetFbp, view_motion
 from recon.least_squares.inset_problem import InsetProblem
-from recon.motion import _about, _basis, _believed, _Found, _likelihood, _Problem, estimate_motion
-from recon.study.motion_found import AlongAxis, Jump
+from recon.motion import (
+    _about,
+    _basis,
+    _believed,
+    _Found,
+    _likelihood,
+    _MotionProblem,
+    estimate_motion,
+)
+from recon.study.motion_found import AlongAxis, JumpMotion
 from recon.study.paths import KINDS, true_path
 from recon.variable_projection import Normal
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, acquire, full_turn
@@ -134,7 +142,7 @@ def test_readings_are_moved_to_where_they_would_be_at_rest(detector):
 @pytest.mark.extended
 def test_a_jump_is_found_and_said():
     """Along the ray of its view, where no view sees it."""
-    jump = Jump("vessel", 0.8, direction=0.0, at_s=0.5 * TURN_S)
+    jump = JumpMotion("vessel", 0.8, direction=0.0, at_s=0.5 * TURN_S)
     scan = _scan(jump).with_noise(EXPOSURE_S, 0)
     found = estimate_motion(scan, GRID)
     path = view_motion(jump, scan.geometry, TURN_S)
@@ -221,7 +229,7 @@ def test_what_the_readings_leave_open_stays_open():
 def test_loops_are_covered(moving):
     """Drawn in the equations of one scan, whose noise they have: 95 % within two errors, of all
     together."""
-    problem = _Problem(moving.with_noise(EXPOSURE_S, 0), GRID, None)
+    problem = _MotionProblem(moving.with_noise(EXPOSURE_S, 0), GRID, None)
     at = np.linalg.lstsq(problem.basis, _truth(moving)[1], rcond=None)[0]
     seen = problem.at(at)[0]
     precision = _likelihood(seen, at, problem.inflation)[0]
@@ -276,14 +284,14 @@ def test_a_jump_has_the_view_the_size_and_the_errors_of_its_coefficients():
 
 def test_a_jump_of_averaged_views_is_one_between_two_of_the_scan():
     averaged = SimpleNamespace(_averaging=np.kron(np.eye(4), np.full(2, 0.5)))
-    assert _Problem.first_view(averaged, 2) == 4
-    assert _Problem.late(averaged, 2) == pytest.approx([-0.5] * 4 + [0.5] * 4)
-    assert _Problem.late(averaged, 3) == pytest.approx([-0.25] * 6 + [0.75] * 2)
+    assert _MotionProblem.first_view(averaged, 2) == 4
+    assert _MotionProblem.late(averaged, 2) == pytest.approx([-0.5] * 4 + [0.5] * 4)
+    assert _MotionProblem.late(averaged, 3) == pytest.approx([-0.25] * 6 + [0.75] * 2)
 
 
 def test_a_jump_at_the_same_view_is_no_gain(moving):
     """Nor are views before the first and behind the last asked for."""
-    problem = _Problem(moving.with_noise(EXPOSURE_S, 0), GRID, None).with_jump(24)
+    problem = _MotionProblem(moving.with_noise(EXPOSURE_S, 0), GRID, None).with_jump(24)
     at = np.zeros((problem.basis.shape[1], 3))
     effects = problem.at(at)[1]
     same, other = problem.gains([24, 12], at, effects)
@@ -295,7 +303,7 @@ def test_a_jump_at_the_same_view_is_no_gain(moving):
 
 
 def test_voxels_are_no_larger_than_cells(moving):
-    coarse = _Problem(moving, VolumeGrid((4, 7, 7), 1.0, GRID.center), None)
+    coarse = _MotionProblem(moving, VolumeGrid((4, 7, 7), 1.0, GRID.center), None)
     assert max(coarse.grid.spacing) == pytest.approx(moving.geometry.cell)
 
 

@@ -113,7 +113,7 @@ def find_defects(
     known: Tensor | None = None,
     photon: float = 1.0,
     electronic_noise: float = 0.0,
-    cells: Cells | None = None,
+    cells: DefectiveCells | None = None,
 ) -> Defects:
     """Find readings that no object can cause.
 
@@ -197,7 +197,7 @@ def find_defects(
     )
 
 
-class Cells(NamedTuple):
+class DefectiveCells(NamedTuple):
     """Views without signal ``(views,)``, dead cells and cells of a wrong gain ``(rows, detector
     columns)``, bool."""
 
@@ -286,7 +286,7 @@ def _dead_cells(sums: NDArray[np.float64], light: float) -> NDArray[np.bool_]:
 
 def wrong_cells(
     sums: NDArray[np.float64], lost: NDArray[np.bool_], photon: float, light: float
-) -> Cells:
+) -> DefectiveCells:
     """Cells that are dead or of a wrong gain, by :func:`cell_sums` of all rows; see
     :func:`find_defects`."""
     dead = _dead_cells(sums, light)
@@ -301,7 +301,7 @@ def wrong_cells(
         error = np.hypot(np.sqrt(1.5 * photon / np.maximum(level * times, photon)), usual)
         hot = some & (np.abs(deviation) > np.maximum(GAIN_ERROR, _SIGMAS * error)) & (level > light)
         hot = _alone(deviation, hot, some)
-    return Cells(lost, dead, hot)
+    return DefectiveCells(lost, dead, hot)
 
 
 def _alone(
@@ -619,7 +619,7 @@ def photon_and_light(scan: Scan) -> tuple[float, float]:
 
 
 def repair_defects(
-    scan: Scan, cells: Cells | None = None, photon: float | None = None
+    scan: Scan, cells: DefectiveCells | None = None, photon: float | None = None
 ) -> tuple[Scan, list[str]]:
     """A scan whose impossible readings are interpolated from their neighbours, and what was done.
 

@@ -19,7 +19,6 @@ from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, Volume
 from torchpcct.kernel_cache import announce_compilation
 from torchpcct.projector.cuda import passes as cuda
 from torchpcct.projector.cuda import vector_passes as cuda_vectors
-from torchpcct.projector.cuda.vector_cells import Limits
 from torchpcct.projector.tables import Tables, VectorTables
 from torchpcct.vector_geometry import VectorGeometry
 
@@ -80,15 +79,9 @@ class Engine:
         if device in self._devices:
             return self._devices[device]
         if isinstance(self.tables, VectorTables):
-            self._devices[device] = cuda_vectors.GpuVectorPasses(
-                self.tables, device, _vector_limits()
-            )
+            self._devices[device] = cuda_vectors.GpuVectorPasses(self.tables, device)
         else:
-            from torchpcct.projector.cpu.cone_kernels import (
-                MAX_LAYERS_PER_SLAB,
-                NEAREST,
-                tabulate_cells,
-            )
+            from torchpcct.projector.cpu.cone_kernels import tabulate_cells
 
             t, r = self.tables, self.tables.rays
             cells, axes = (
@@ -106,9 +99,7 @@ class Engine:
                 cells,
                 axes,
             )
-            self._devices[device] = cuda.GpuPasses(
-                t, device, cells, axes, NEAREST, MAX_LAYERS_PER_SLAB
-            )
+            self._devices[device] = cuda.GpuPasses(t, device, cells, axes)
         return self._devices[device]
 
     def shapes(self, transposed: bool) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -144,7 +135,7 @@ class Engine:
         if device == "cpu":
             return self.cpu.workspace(batch, itemsize)
         if isinstance(self.tables, VectorTables):
-            return cuda_vectors.workspace(self.tables, _vector_limits(), batch, itemsize)
+            return cuda_vectors.workspace(self.tables, batch, itemsize)
         return cuda.workspace(self.tables, batch, itemsize)
 
     def _trusted_on(self, device: torch.device, dtype: torch.dtype) -> cuda.DevicePasses:
@@ -218,9 +209,3 @@ def _small_scan(tables: Tables | VectorTables) -> tuple[str, Tables | VectorTabl
             )
     name = f"VectorGeometry, {'parallel' if parallel else 'point source'}, {grid.ndim}-D"
     return name, VectorTables(turned, grid)
-
-
-def _vector_limits() -> Limits:
-    from torchpcct.projector.cpu import vector_kernels as cpu
-
-    return Limits(cpu.NEAREST, cpu.POINT, cpu._MOST_PARTS, cpu._SLOPE, cpu._SMALL)

@@ -31,6 +31,21 @@ if TYPE_CHECKING:
 
 LAYER_SHIFT = 0.04
 """Row edges may move by this part of the blur between two depth layers (see layer_spacing)."""
+MAX_LAYERS_PER_SLAB = 0.4
+"""Slabs farther apart than this part of a layer are interpolated one by one (see
+layer_spacing)."""
+NEAREST = 1e-6
+"""Slabs closer to the source than this part of the way to the detector are behind it."""
+POINT = 1e-9
+"""A rectangle narrower than this part of a voxel is a point."""
+MOST_PARTS = 256
+"""Of a cell that is cut into parts, along either step of the detector."""
+LEAST_SLOPE = 0.2
+"""A cell is cut where the mixed second moment of its footprint is above this fraction of the
+geometric mean of the other two, and above :data:`LEAST_SLANT`: a rectangle along the axes will do
+for others."""
+LEAST_SLANT = 0.1
+"""The same, as a fraction of a voxel's."""
 
 
 class Tables:

@@ -154,7 +154,7 @@ class Images:
 
 
 @dataclass(frozen=True)
-class Seen:
+class PictureVolumes:
     """Geometry, truth and volumes of the pictures."""
 
     scan: SpectralScan
@@ -208,7 +208,7 @@ def measure(
         for name in ("necrotic_core", "blood_iodine")
     }
     data |= {"basis_residual_hu": residual, "processor_seconds": time.process_time() - spent}
-    return Measured(s, data, Seen(scan, tissues, images))
+    return Measured(s, data, PictureVolumes(scan, tissues, images))
 
 
 def plan(settings: SpectralSettings, folder: str | Path | None) -> None:

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from tiny_studies import assert_report_is_whole
 
-from recon.motion import InsetMotion, PathTooLongError
-from recon.motion import Jump as Said
+from recon.motion import InsetMotion, Jump, PathTooLongError
 from recon.study import motion_found
-from recon.study.motion_found import Jump
+from recon.study.motion_found import JumpMotion
 from recon.study.paths import KINDS, SMOOTH, _together, compared, drawn
 
 
@@ -16,7 +15,7 @@ def test_vessels_are_drawn_by_their_numbers(kind):
     scene, grid, motions = drawn(kind, 3)
     assert drawn(kind, 3)[2] == motions
     assert any(m != n for m, n in zip(drawn(kind, 4)[2], motions, strict=False)) or not motions
-    assert any(isinstance(m, Jump) for m in motions) is (kind not in SMOOTH)
+    assert any(isinstance(m, JumpMotion) for m in motions) is (kind not in SMOOTH)
     assert {m.body for m in motions} <= {b.name for b in scene.bodies}
     y, x = grid.center[1:]
     assert 15.0 <= np.hypot(x, y) <= 55.0
@@ -27,11 +26,11 @@ def test_an_estimate_is_compared_with_the_truth():
     truth[5:, 2] = 0.4
     truth -= truth.mean(0)
     path, errors = truth + np.array([0.0, 0.03, 0.04]), np.full((10, 3), 0.018)
-    said = Said(5, np.array([0.0, 0.0, 0.5]), np.full(3, 0.1))
+    said = Jump(5, np.array([0.0, 0.0, 0.5]), np.full(3, 0.1))
     found = InsetMotion(
         path, errors, True, 9.0, 0.2, (2.0, 1.0), 3, ["parts move differently"], said
     )
-    row = compared(found, truth, Jump("wall", 0.4, at_s=0.1))
+    row = compared(found, truth, JumpMotion("wall", 0.4, at_s=0.1))
     assert row["error_mm"] == pytest.approx(0.05)
     assert row["true_mm"] == pytest.approx(0.2)
     assert row["inside"] == pytest.approx(2 / 3)
@@ -40,7 +39,7 @@ def test_an_estimate_is_compared_with_the_truth():
     assert row["jump_error_mm"] == pytest.approx(0.1)
     assert compared(found, truth, None)["jump_mm"] is None
     # A refused estimate has no error, and changes none.
-    refused = compared(None, truth, Jump("wall", 0.4, at_s=0.1))
+    refused = compared(None, truth, JumpMotion("wall", 0.4, at_s=0.1))
     assert refused["refused"]
     assert refused["true_mm"] == row["true_mm"]
     both = _together([r | {"cpu_seconds": 1.0} for r in (row, refused)])

@@ -27,15 +27,11 @@ from numba import njit
 from torchpcct.kernel_cache import forget_outdated
 from torchpcct.projector.cpu.simd import add_lines, spread_line, spread_lines, sum_lines
 from torchpcct.projector.cpu.simd_interpolation import add_steps, set_steps
+from torchpcct.projector.tables import MAX_LAYERS_PER_SLAB, NEAREST
 from torchpcct.threads import run
 
 _FLAGS = {"contract", "nsz", "arcp", "reassoc"}
 """NaN and Inf must survive, so only the flags that leave them alone."""
-MAX_LAYERS_PER_SLAB = 0.4
-"""Slabs farther apart than this part of a layer are interpolated one by one (see
-tables.layer_spacing)."""
-NEAREST = 1e-6
-"""Slabs closer to the source than this part of the source-detector distance are behind it."""
 SLAB_BLOCK = 24
 """Slabs of one task of the adjoint: enough to reuse a layer, few enough to share the work. Fixed,
 for determinism."""

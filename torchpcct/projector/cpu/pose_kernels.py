@@ -18,14 +18,13 @@ from numba import njit
 from torchpcct.kernel_cache import forget_outdated
 from torchpcct.projector.cpu.cone_kernels import INNER
 from torchpcct.projector.cpu.vector_kernels import (
-    NEAREST,
-    POINT,
     cell_parts,
     main_axis,
     overlap,
     place_cell,
     start_ray,
 )
+from torchpcct.projector.tables import NEAREST, POINT
 
 _small = njit(**INNER)
 

@@ -24,20 +24,10 @@ from numba import njit
 
 from torchpcct.kernel_cache import forget_outdated
 from torchpcct.projector.cpu.cone_kernels import INNER
+from torchpcct.projector.tables import LEAST_SLANT, LEAST_SLOPE, MOST_PARTS, NEAREST, POINT
 
 SLAB_BLOCK = 16
 """Slabs of one task of the adjoint."""
-NEAREST = 1e-6
-"""Slabs closer to the source than this part of the way to the detector are behind it."""
-_MOST_PARTS = 256
-"""Of a cell, along either step."""
-_SLOPE = 0.2
-"""A rectangle along the axes will do where the footprint's mixed second moment is below this
-fraction of the geometric mean of the other two."""
-_SMALL = 0.1
-"""Or below this fraction of a voxel's."""
-POINT = 1e-9
-"""A rectangle narrower than this part of a voxel is a point."""
 _small = njit(**INNER)
 
 
@@ -109,10 +99,12 @@ def cell_parts(pose, ray, parallel, axis, lower, spacing, shape):
         (pose[3, b] - ray[1, b] * v) / spacing[b] * scale,
     )
     parts_u = parts_v = 1
-    while max(parts_u, parts_v) < _MOST_PARTS:
+    while max(parts_u, parts_v) < MOST_PARTS:
         pa, pb, qa, qb = ua / parts_u, ub / parts_u, va / parts_v, vb / parts_v
         across = abs(pa * pb + qa * qb)
-        if across <= max(_SMALL, _SLOPE * math.sqrt((pa * pa + qa * qa) * (pb * pb + qb * qb))):
+        if across <= max(
+            LEAST_SLANT, LEAST_SLOPE * math.sqrt((pa * pa + qa * qa) * (pb * pb + qb * qb))
+        ):
             break
         if abs(pa * pb) >= abs(qa * qb):
             parts_u += 1

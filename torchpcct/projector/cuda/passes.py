@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpcct.projector.tables import Tables
+from torchpcct.projector.tables import MAX_LAYERS_PER_SLAB, NEAREST, Tables
 
 if TYPE_CHECKING:
     from torchpcct.typing import Floats
@@ -55,8 +55,6 @@ class GpuPasses(DevicePasses):
         tables: of the scan.
         device: where the tables live and the passes run.
         cells, axes: of all cells, see ``cone_kernels.tabulate_cells``.
-        nearest, layers_per_slab: limits of the CPU's cone-beam kernels (``NEAREST``,
-            ``MAX_LAYERS_PER_SLAB``).
     """
 
     def __init__(
@@ -65,19 +63,16 @@ class GpuPasses(DevicePasses):
         device: torch.device,
         cells: object,
         axes: object,
-        nearest: float,
-        layers_per_slab: float,
     ) -> None:
         self.tables, self.device = tables, device
         self.plane = tables.grid.ndim == 2
-        self.limits = (nearest, layers_per_slab)
         self.lanes = LANES
         self._cells = np.asarray(cells)
         self.bits = _bits(self._cells, max(tables.grid.shape[-2:]))
         lines = np.rint(self._cells[..., :4] * 2.0**self.bits).astype(np.int64)
         self.lines = torch.from_numpy(lines).to(device)
         self.axes = torch.from_numpy(np.ascontiguousarray(axes)).to(device)
-        self.touched = _touched(self._cells, axes, tables, nearest)
+        self.touched = _touched(self._cells, axes, tables)
         self.segments = [_Segments(tables, self._cells, axis, device) for axis in (0, 1)]
         self._numbers: dict[torch.dtype, _Numbers] = {}
 
@@ -90,7 +85,6 @@ class GpuPasses(DevicePasses):
     def _made(self, dtype: torch.dtype) -> _Numbers:
         nz = self._shape()[0]
         rays, tables = self.tables.rays, self.tables
-        nearest, layers = self.limits
         z0, dz, row0, pitch = (0.0, 1.0, 0.0, 1.0) if self.plane else tables.heights
         layer = 1.0 if self.plane else tables.layer
         source, foot = tables.pose[:, 2], tables.pose[:, 7]
@@ -107,9 +101,9 @@ class GpuPasses(DevicePasses):
         )
         numbers = [
             2.0**-self.bits,
-            nearest,
+            NEAREST,
             layer,
-            layers * layer,
+            MAX_LAYERS_PER_SLAB * layer,
             pitch / dz,
             pitch,
             dz / pitch,
@@ -356,14 +350,14 @@ def _bits(cells: Floats, slabs: int) -> int:
     return 61 - math.ceil(math.log2(p + q * slabs + slabs))
 
 
-def _touched(cells: Floats, axes: object, tables: Tables, nearest: float) -> int:
+def _touched(cells: Floats, axes: object, tables: Tables) -> int:
     """Voxels that a cell of a plane touches in a slab at most."""
     ny, nx = tables.grid.shape[-2:]
     p0, q0, p1, q1, l0, l1 = np.moveaxis(cells[..., :6], -1, 0)
     widest = 0.0
     for slab in (np.zeros_like(p0), np.where(axes == 0, ny, nx) - 1.0):
         wide = np.abs(p1 - p0 + (q1 - q0) * slab)
-        seen = np.ones_like(wide, bool) if tables.rays.parallel else l0 + l1 * slab > nearest
+        seen = np.ones_like(wide, bool) if tables.rays.parallel else l0 + l1 * slab > NEAREST
         widest = max(widest, float(wide[seen].max(initial=0.0)))
     return int(min(math.floor(widest) + 2, max(ny, nx)))
 

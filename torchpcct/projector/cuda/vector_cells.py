@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpcct.projector.tables import VectorTables, along_xyz
+from torchpcct.projector.tables import LEAST_SLANT, LEAST_SLOPE, MOST_PARTS, VectorTables, along_xyz
 
 if TYPE_CHECKING:
     from torchpcct.typing import Floats
@@ -19,16 +19,6 @@ if TYPE_CHECKING:
 
 ORDER = np.array([[0, 2, 1], [1, 2, 0], [2, 1, 0]])
 """Of each main axis itself, a and b: 0 x, 1 y, 2 z."""
-
-
-class Limits(NamedTuple):
-    """Constants of the CPU's kernels, see :mod:`torchpcct.projector.cpu.vector_kernels`."""
-
-    nearest: float
-    point: float
-    most_parts: int
-    slope: float
-    small: float
 
 
 class Cells(NamedTuple):
@@ -89,12 +79,11 @@ class VectorCells:
     Args:
         tables: of the scan.
         device: where they are computed.
-        limits: of the CPU's kernels.
     """
 
-    def __init__(self, tables: VectorTables, device: torch.device, limits: Limits) -> None:
+    def __init__(self, tables: VectorTables, device: torch.device) -> None:
         g, grid = tables.geometry, tables.grid
-        self.limits, self.parallel, self.device = limits, g.parallel, device
+        self.parallel, self.device = g.parallel, device
         self.views, self.rows, self.columns = g.views, g.rows or 1, g.columns
         self.shape, spacing, center = along_xyz(grid)
         lower = center - self.shape * spacing / 2
@@ -234,11 +223,10 @@ class VectorCells:
             for step in (u, v)
             for k, s in ((1, sa), (2, sb))
         )
-        limits = self.limits
 
         def too_slanted(pa: Tensor, pb: Tensor, qa: Tensor, qb: Tensor) -> Tensor:
-            least = limits.slope * torch.sqrt((pa * pa + qa * qa) * (pb * pb + qb * qb))
-            return (pa * pb + qa * qb).abs() > least.clamp_min_(limits.small)
+            least = LEAST_SLOPE * torch.sqrt((pa * pa + qa * qa) * (pb * pb + qb * qb))
+            return (pa * pb + qa * qb).abs() > least.clamp_min_(LEAST_SLANT)
 
         found = too_slanted(ua, ub, va, vb)
         if not found.any():
@@ -248,7 +236,7 @@ class VectorCells:
         while True:
             pa, pb, qa, qb = ua / along_u, ub / along_u, va / along_v, vb / along_v
             more = too_slanted(pa, pb, qa, qb)
-            more &= torch.maximum(along_u, along_v) < limits.most_parts
+            more &= torch.maximum(along_u, along_v) < MOST_PARTS
             if not more.any():
                 break
             longer = (pa * pb).abs() >= (qa * qb).abs()

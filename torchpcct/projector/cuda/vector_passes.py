@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from torchpcct.projector.cuda.passes import LANES, DevicePasses
-from torchpcct.projector.cuda.vector_cells import ORDER, Limits, VectorCells, bits_of
-from torchpcct.projector.tables import VectorTables, along_xyz
+from torchpcct.projector.cuda.vector_cells import ORDER, VectorCells, bits_of
+from torchpcct.projector.tables import NEAREST, POINT, VectorTables, along_xyz
 
 if TYPE_CHECKING:
     from torchpcct.typing import Floats
@@ -37,12 +37,11 @@ class GpuVectorPasses(DevicePasses):
     Args:
         tables: of the scan.
         device: where the passes run.
-        limits: of the CPU's kernels.
     """
 
-    def __init__(self, tables: VectorTables, device: torch.device, limits: Limits) -> None:
+    def __init__(self, tables: VectorTables, device: torch.device) -> None:
         self.tables, self.device = tables, device
-        self.cells = VectorCells(tables, device, limits)
+        self.cells = VectorCells(tables, device)
         self.plane, self.parallel = tables.grid.ndim == 2, tables.geometry.parallel
         self.lanes = LANES
         shape = self.cells.shape
@@ -62,11 +61,11 @@ class GpuVectorPasses(DevicePasses):
     def _of(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Numbers and projections in a dtype."""
         if dtype not in self._sent:
-            limits, cells = self.cells.limits, self.cells
+            cells = self.cells
             numbers = [
                 2.0**-self.bits,
-                limits.nearest,
-                limits.point,
+                NEAREST,
+                POINT,
                 cells.rows - 1.0,
                 cells.columns - 1.0,
                 *((cells.shape - 1) / 2).tolist(),
@@ -223,9 +222,9 @@ def _table_limit(budget: int | None) -> int:
     return _TABLE_BYTES if budget is None else min(_TABLE_BYTES, budget // 2)
 
 
-def workspace(tables: VectorTables, limits: Limits, batch: int, itemsize: int) -> int:
+def workspace(tables: VectorTables, batch: int, itemsize: int) -> int:
     """Bytes that one pass of a whole batch on a CUDA device holds besides input and output."""
-    cells = VectorCells(tables, torch.device("cpu"), limits)
+    cells = VectorCells(tables, torch.device("cpu"))
     each = cells.rows * cells.columns
     # How long cells are cut changes slowly over a detector.
     parts = cells.survey(cells.views, samples=5).split[:, 2]
