@@ -25,10 +25,10 @@ _ONE_KIND = (("tif", "tiff"), ("yaml", "yml"), ("h5", "hdf5", "hdf"), ("nxs", "n
 def matching(pattern: str, folder: Path) -> list[Path]:
     """Files that a name or pattern means, in the order of the numbers in their names.
 
-    A pattern may be an absolute path, and its ending may be another one of the same format
-    (``.TIF``, ``.tiff`` and ``.TIFF`` for ``.tif``), unless it holds brackets (``*.ti[f]``). Hidden
-    files (``._1.tif`` of a Mac) are left out, as a shell does. A file that is called like the
-    pattern itself is that file.
+    A pattern may be an absolute path. Its ending is found in any capitals (``.TIF`` for ``.tif``)
+    and, where no file has it, another one of the same format is (``.tiff``), unless it holds
+    brackets (``*.ti[f]``). Hidden files (``._1.tif`` of a Mac) are left out, as a shell does. A
+    file that is called like the pattern itself is that file.
 
     Args:
         pattern: ``*``, ``?``, ``[...]`` and ``**`` as in a shell.
@@ -40,13 +40,13 @@ def matching(pattern: str, folder: Path) -> list[Path]:
     """
     if not glob.has_magic(pattern) or (folder / pattern).exists():
         return [folder / pattern]
-    found = {
-        folder / name
-        for wanted in _with_its_endings(pattern)
-        for name in glob.glob(wanted, root_dir=folder, recursive=True)
-    }
-    files = sorted(path for path in found if not path.is_dir() or path.suffix.lower() == ".zarr")
-    if not files:
+    files: list[Path] = []
+    for wanted in _with_its_endings(pattern):
+        found = {folder / name for name in glob.glob(wanted, root_dir=folder, recursive=True)}
+        files += sorted(p for p in found if not p.is_dir() or p.suffix.lower() == ".zarr")
+        if files:
+            break
+    else:
         raise FileNotFoundError(f"no file matches {folder / pattern}")
     stems: dict[tuple[Path, tuple[str, ...]], Path] = {}
     for path in files:
@@ -66,13 +66,14 @@ def _kind(ending: str) -> tuple[str, ...]:
 
 
 def _with_its_endings(pattern: str) -> list[str]:
-    """Patterns that find the same names with any ending of the same format, in any capitals."""
+    """Patterns that find the same names in any capitals, with the own ending first, then with each
+    other one of the same format."""
     stem, point, ending = pattern.rpartition(".")
     if not point or not ending or set(ending) & set("[]/\\"):
         return [pattern]
     return [
         f"{stem}." + "".join(f"[{c}{c.upper()}]" if c.isalpha() else c for c in each)
-        for each in _kind(ending)
+        for each in sorted(_kind(ending), key=ending.lower().__ne__)
     ]
 
 

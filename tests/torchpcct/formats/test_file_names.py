@@ -98,20 +98,25 @@ def test_patterns_find_all_endings_of_a_format_and_leave_hidden_files(tmp_path, 
         np.testing.assert_array_equal(stack(tmp_path, pattern, names), READINGS[:, 0])
 
 
-def test_endings_of_one_format_may_mix_and_one_image_twice_is_refused(tmp_path):
-    names = [f"p{k:02d}{('.tif', '.TIFF', '.tiff', '.TIF')[k % 4]}" for k in range(12)]
-    np.testing.assert_array_equal(stack(tmp_path, "p*.tif", names), READINGS[:, 0])
+def test_a_pattern_means_its_own_ending_and_one_image_twice_is_refused(tmp_path):
+    names = [f"p{k:02d}{('.tif', '.TIF', '.Tif')[k % 3]}" for k in range(12)]
+    np.testing.assert_array_equal(stack(tmp_path, "p*.tiff", names), READINGS[:, 0])
+    # A copy with another ending of the format is not meant, nor are files of other formats.
     (tmp_path / "p00.tiff").write_bytes((tmp_path / "p00.tif").read_bytes())
-    with pytest.raises(
-        ValueError,
-        match=r"p00\.tif and p00\.tiff both match p\*\.tif, one image .* as p\*\.ti\[f\],",
-    ):
-        matching("p*.tif", tmp_path)
-    assert [p.name for p in matching("p*.ti[f]", tmp_path)] == ["p00.tif", "p04.tif", "p08.tif"]
-    # Beside them, files of other formats with the same names, which the pattern does not mean.
-    (tmp_path / "p00.tiff").unlink()
     (tmp_path / "p00.txt").touch()
     assert [p.name for p in matching("p*.tif", tmp_path)] == names
+    assert [p.name for p in matching("p*.tiff", tmp_path)] == ["p00.tiff"]
+    with pytest.raises(
+        ValueError, match=r"p00\.tif and p00\.tiff both match p\*\.tif\*, one image"
+    ):
+        matching("p*.tif*", tmp_path)
+    (tmp_path / "p00.TIF").write_bytes((tmp_path / "p00.tif").read_bytes())
+    with pytest.raises(
+        ValueError,
+        match=r"p00\.TIF and p00\.tif both match p\*\.tif, one image .* as p\*\.ti\[f\],",
+    ):
+        matching("p*.tif", tmp_path)
+    assert [p.name for p in matching("p*.ti[f]", tmp_path)] == [n for n in names if ".tif" in n]
 
 
 def test_a_pattern_may_be_absolute_and_its_folder_may_hold_brackets(tmp_path):
