@@ -1,10 +1,12 @@
 """Command line: ``torchpcct`` alone says where to begin.
 
-:mod:`~recon.cli.starting` has the first commands of a newcomer, :mod:`~recon.cli.scans` those that
-make scans and volumes, :mod:`~recon.cli.measuring` the measurement of methods and the studies,
-:mod:`~recon.cli.looking` what shows files, :mod:`~recon.cli.plaque` reads tissues,
-:mod:`~torchpcct.acquisition.config` reads the configuration of ``simulate``,
-:mod:`~recon.cli.parsing` is what all share.
+:mod:`~recon.cli.start` has the first commands of a newcomer; :mod:`~recon.cli.simulate` makes
+scans, :mod:`~recon.cli.reconstruct` volumes of them, :mod:`~recon.cli.calibrate` their geometry;
+:mod:`~recon.cli.evaluate` and :mod:`~recon.cli.recovery` measure methods, :mod:`~recon.cli.studies`
+runs the studies; :mod:`~recon.cli.view` shows files, :mod:`~recon.cli.plaque` reads tissues.
+:mod:`~recon.cli.scan_options` are the options of every scan that is read, :mod:`~recon.cli.parsing`
+is what all commands share; :mod:`~torchpcct.acquisition.config` reads the configuration of
+``simulate``.
 """
 
 from __future__ import annotations
@@ -17,17 +19,9 @@ import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from recon.cli.looking import add_info, add_view
-from recon.cli.measuring import (
-    add_compare,
-    add_dose_factor,
-    add_evaluate,
-    add_hardcases,
-    add_recovery,
-    add_show_task,
-    add_study,
-    add_verify,
-)
+# What loads torch or numba is imported by the commands: help and refusals come at once.
+from recon.cli.calibrate import add_calibrate
+from recon.cli.evaluate import add_dose_factor, add_evaluate, add_show_task
 from recon.cli.parsing import (
     Commands,
     Ended,
@@ -38,17 +32,13 @@ from recon.cli.parsing import (
     is_path,
     saying,
 )
-
-# What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.plaque import add_plaque
-from recon.cli.scans import (
-    add_calibrate,
-    add_lower_dose,
-    add_reconstruct,
-    add_show_config,
-    add_simulate,
-)
-from recon.cli.starting import add_demo, add_doctor, add_train, demo_steps, train
+from recon.cli.reconstruct import add_reconstruct
+from recon.cli.recovery import add_recovery
+from recon.cli.simulate import add_lower_dose, add_show_config, add_simulate
+from recon.cli.start import add_demo, add_doctor, add_train, demo_steps, train
+from recon.cli.studies import add_compare, add_hardcases, add_study, add_verify
+from recon.cli.view import add_info, add_view
 from torchpcct import __version__
 from torchpcct.files import WriteError, speak_any_encoding
 

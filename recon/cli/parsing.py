@@ -53,6 +53,11 @@ PLACE: Limits = {"low": -1e12, "high": 1e12, "unit": "mm"}
 """Limits of positions, as of lengths."""
 FORCE = ("--force", bool, None, "replace a file that another command or software has made")
 """Option of all commands that write."""
+PLAN_OPTIONS = (
+    ("--dry-run", bool, None, "print the plan, memory and time; compute nothing"),
+    ("--json", bool, None, "print the whole summary as JSON"),
+)
+"""Options of commands that make scans and volumes."""
 
 
 class _Help(argparse.HelpFormatter):

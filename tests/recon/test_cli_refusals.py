@@ -22,7 +22,7 @@ from fresh_python import run_python
 
 from recon.cli import _parser
 from recon.cli.parsing import check_limits
-from recon.cli.scans import _length
+from recon.cli.scan_options import length
 from recon.jobs.store import Store
 from recon.study import registry
 from torchpcct import ParallelBeam, Scan, Volume, VolumeGrid
@@ -162,7 +162,7 @@ def _refused(parser, action, words, value):
 
 
 def test_every_number_of_the_command_line_has_limits(capsys):
-    numbers = [option for option in _options() if option[2].type in (int, float, _length)]
+    numbers = [option for option in _options() if option[2].type in (int, float, length)]
     assert len(numbers) > 60
     values = ("nan", "inf", "-inf", "1e400", "1e30", "9" * 40, "x")
     assert not [

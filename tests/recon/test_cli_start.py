@@ -15,7 +15,7 @@ from fresh_python import run_python
 
 import recon.api
 from recon.cli import _parser as make_parser
-from recon.cli import doctor, main, starting
+from recon.cli import doctor, main, start
 from torchpcct import Volume
 
 ROOT = Path(__file__).parent.parent.parent
@@ -80,7 +80,7 @@ def test_a_slip_is_answered_with_what_was_meant(here, cli, words, expected_text)
 def test_the_demo_does_what_its_lines_do(quick, tmp_path, cli, monkeypatch):
     if quick:  # FBP in place of MBIR
         real = recon.api.reconstruct
-        monkeypatch.setattr(starting, "_DEMO_VIEWS", 12)
+        monkeypatch.setattr(start, "_DEMO_VIEWS", 12)
         monkeypatch.setattr(
             "recon.api.reconstruct", lambda scan, grid, method, **_: real(scan, grid, "fbp")
         )

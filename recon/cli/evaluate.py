@@ -1,12 +1,10 @@
-"""The commands that measure: ``evaluate``, ``recovery``, ``dose-factor``, ``show-task``;
-``compare``, ``hardcases``, ``study``, ``verify``."""
+"""The commands that compare methods: ``evaluate``, ``dose-factor``, ``show-task``."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import shlex
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,18 +23,12 @@ from recon.cli.parsing import (
     executing,
     find_modules_here,
 )
-from recon.cli.scans import add_reader_options, grid_of_scan, reader_options
-from recon.names import METHODS
-from recon.study import registry
-from recon.study.names import check_case
-from torchpcct.files import atomic_write, require_writable
-from torchpcct.validate import choice
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from recon.evaluate.without_truth import Comparison
-    from recon.study.study import ProgressBars, StudySettings
+    from recon.study.study import ProgressBars
     from torchpcct.geometry import VolumeGrid
     from torchpcct.typing import Bools
 
@@ -76,6 +68,23 @@ _STUDY_METHODS = (
 )
 """Of ``dose-factor``: every method of the package, and each filter on the kernel on which it has
 the least error."""
+
+
+METHODS_TEXT = """\
+methods: fbp:KERNEL, pwls, mbir, mbir:fidelity=1, mbir:weights=FILE, mbir:vessel, mbir:tissues,
+         mbir:prior=PRIOR (a filter below, or package.module:function),
+         mbir:weights=FILE,network=package.module:Class,
+         FILTER@fbp:KERNEL (gaussian, perona_malik, bilateral, nlm, tv, bm4d),
+         package.module:function of (scan, grid), files:FOLDER;
+         each with energies=CONTRAST among its options (fbp:soft,energies=iodine): energy bins
+         summed with the weights that show the contrast best (task, iodine or two materials A/B)
+
+"""
+"""What the help says of methods."""
+
+
+REALISATIONS = {"low": 8, "high": MANY}
+"""Limits of numbers of noise realisations."""
 
 
 def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
@@ -353,114 +362,6 @@ def _show_task(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     print(task_text(arguments.name), end="")
 
 
-# --- studies --------------------------------------------------------------------------------------
-
-
-def _run_study(
-    name: str, settings: StudySettings, arguments: argparse.Namespace, progress: ProgressBars
-) -> None:
-    """Run a study of the registry, save and print its report."""
-    folder = arguments.out or Path("out") / name
-    require_writable(folder)
-    names = (name, registry.folder(name).replace("_", "-"))
-    check_results(
-        arguments, folder, lambda report: report.get("study") in names, "report.*", "*.png"
-    )
-    from recon.jobs.store import Pieces  # loads torch
-
-    start = time.perf_counter()
-    report = None
-    with executing(arguments, folder):
-        report = registry.run(name, settings, progress, folder)
-    progress.close()
-    if report is None:
-        return
-    files = report.save(folder)
-    Pieces.clear(folder)
-    print(report.screen)
-    print(f"\n{time.perf_counter() - start:.0f} s in all. Written: {', '.join(map(str, files))}")
-
-
-def _study(arguments: argparse.Namespace, progress: ProgressBars) -> None:
-    name, changes = arguments.name, arguments.changes
-    settings = registry.build_settings(
-        name, quick=arguments.quick, seed=arguments.seed, changes=changes
-    )
-    _run_study(name, settings, arguments, progress)
-
-
-def _own_study(arguments: argparse.Namespace, progress: ProgressBars) -> None:
-    """A study that is a command of its own, with options named like its settings."""
-    from recon.evaluate.names import check_method
-
-    for name in arguments.methods or []:
-        if arguments.command == "compare":
-            check_method(name)
-        else:
-            choice("method", name, (*METHODS, "tissues"))
-    for name in getattr(arguments, "cases", None) or []:
-        check_case(name)
-    given = {name: value for name, value in vars(arguments).items() if value is not None}
-    settings = registry.settings_class(arguments.command).of(given, arguments.quick)
-    _run_study(arguments.command, settings, arguments, progress)
-
-
-def _verify(arguments: argparse.Namespace, progress: ProgressBars) -> None:
-    root = arguments.root
-    for name in arguments.again:
-        registry.folder(name)
-    from recon.study import results
-
-    stale = []
-    for name, text in results.render(root).items():
-        if not (root / name).exists() or (root / name).read_text(encoding="utf-8") != text:
-            stale.append(name)
-            if arguments.write:
-                with atomic_write(root / name) as part:
-                    part.write_text(text, encoding="utf-8")
-    outcome = "say what the results say" if not stale else f"rendered: {', '.join(stale)}"
-    print(
-        outcome
-        if arguments.write or not stale
-        else f"stale: {', '.join(stale)} (--write renders them)"
-    )
-    changed = []
-    for name in arguments.again:
-        committed = json.loads(
-            (root / "notebooks" / registry.folder(name) / "report.json").read_text(encoding="utf-8")
-        )
-        settings = registry.settings_class(name).of(committed["settings"])
-        again = json.loads(registry.run(name, settings, progress).json)
-        found = list(results.differences(committed, again))
-        progress.close()
-        print("\n".join([f"{name}: {len(found)} figures differ from the committed ones", *found]))
-        changed += found
-    if (stale and not arguments.write) or changed:
-        raise ValueError(
-            "README.md, notebooks/RESULTS.md and the committed reports do not agree: see above"
-        )
-
-
-# --- parsing --------------------------------------------------------------------------------------
-
-
-_METHODS_TEXT = """\
-methods: fbp:KERNEL, pwls, mbir, mbir:fidelity=1, mbir:weights=FILE, mbir:vessel, mbir:tissues,
-         mbir:prior=PRIOR (a filter below, or package.module:function),
-         mbir:weights=FILE,network=package.module:Class,
-         FILTER@fbp:KERNEL (gaussian, perona_malik, bilateral, nlm, tv, bm4d),
-         package.module:function of (scan, grid), files:FOLDER;
-         each with energies=CONTRAST among its options (fbp:soft,energies=iodine): energy bins
-         summed with the weights that show the contrast best (task, iodine or two materials A/B)
-
-"""
-"""What the help says of methods."""
-
-
-REALISATIONS = {"low": 8, "high": MANY}
-"""Limits of numbers of noise realisations."""
-
-
 def add_evaluate(commands: Commands) -> None:
     parser = command(
         commands,
@@ -475,7 +376,7 @@ def add_evaluate(commands: Commands) -> None:
         "torchpcct evaluate --task nodule --method mbir --n 20",
         "torchpcct evaluate --task my.yaml --method mylab.nets:reconstruct --denoiser "
         "mylab.nets:denoise@fbp:detail",
-        before=_METHODS_TEXT,
+        before=METHODS_TEXT,
         out="folder for report.md, .json, .csv, .html and pictures (default out/evaluate)",
     )
     parser.set_defaults(tasks=("plaque",), methods=("fbp:soft", "bilateral@fbp:detail", "mbir"))
@@ -545,109 +446,6 @@ def add_evaluate(commands: Commands) -> None:
     )
 
 
-# --- recovery -------------------------------------------------------------------------------------
-
-
-def _recovery(arguments: argparse.Namespace, progress: ProgressBars) -> None:
-    from recon.evaluate.insertion import (
-        InsertedBall,
-        contrast_recovery,
-        recovery_table,
-    )
-    from recon.evaluate.methods import names_module
-    from torchpcct.formats.scans import open_scan
-
-    balls = [InsertedBall(*pair) for pair in arguments.ball or _BALLS]
-    methods = arguments.method or ["pwls", "mbir"]
-    if any(map(names_module, methods)):
-        find_modules_here()
-    scan = open_scan(arguments.scan, **reader_options(arguments))
-    found = contrast_recovery(
-        scan,
-        grid_of_scan(scan, arguments),
-        methods,
-        balls,
-        places=arguments.at,
-        n=arguments.n,
-        seed=arguments.seed,
-    )
-    if arguments.json:
-        print(json.dumps([row.as_dict() for row in found], indent=2))
-    else:
-        print(recovery_table(found))
-
-
-_BALLS = ((0.5, 600.0), (1.0, 100.0), (1.0, -100.0), (2.0, 30.0))
-"""Diameters in mm and contrasts in HU that are tried where none are named: a calcification, plaque
-in fat and fat in plaque, what is faint."""
-
-
-def add_recovery(commands: Commands) -> None:
-    """Add the command."""
-    parser = command(
-        commands,
-        "recovery",
-        _recovery,
-        "what a method would show of a lesion in your scan",
-        "Insert balls of known size and contrast into the readings of a scan, measured or "
-        "simulated, reconstruct it with and without them, and print how much of their contrast "
-        "each method shows, beside soft FBP of the same scan. A method with a prior may show less "
-        "of what is small or faint, the less the lower the dose.",
-        "torchpcct recovery scan.h5 --method mbir --method pwls",
-        "torchpcct recovery scan.h5 --ball 1.5 -60 --method mbir:fidelity=1",
-        before=_METHODS_TEXT,
-    )
-    add_reader_options(parser)
-    add_options(
-        parser,
-        (
-            "--method",
-            str,
-            None,
-            "to measure, repeat for more (default pwls, mbir)",
-            {"action": "append"},
-        ),
-        (
-            "--ball",
-            float,
-            ("MM", "HU"),
-            "diameter and contrast, repeat for more (default 0.5 mm +600 HU, 1 mm ±100 HU, "
-            "2 mm +30 HU)",
-            {"nargs": 2, "action": "append"},
-        ),
-        (
-            "--at",
-            float,
-            "MM",
-            "middle of a ball, Z Y X, of one slice Y X; repeat for more (default: places in the "
-            "object)",
-            {"nargs": "+", "action": "append"},
-        ),
-        (
-            "--n",
-            int,
-            None,
-            "places, where none are named (default 8)",
-            {"default": 8, "limits": {"low": 1, "high": MANY}},
-        ),
-        (
-            "--seed",
-            int,
-            None,
-            "of the places (default 0)",
-            {"default": 0, "limits": {"low": 0, "high": MANY}},
-        ),
-        ("--json", bool, None, "print all figures as JSON"),
-    )
-    add_options(
-        parser,
-        ("--voxel", float, "MM", "voxel size (default: the detector's)", {"limits": LENGTH}),
-        ("--extent", float, "MM", "edge lengths, Z Y X", {"nargs": "+", "limits": LENGTH}),
-        ("--center", float, "MM", "centre, Z Y X", {"nargs": "+", "limits": PLACE}),
-        group="voxels",
-    )
-
-
 def add_dose_factor(commands: Commands) -> None:
     parser = command(
         commands,
@@ -658,7 +456,7 @@ def add_dose_factor(commands: Commands) -> None:
         "plaque, its variants, vessels of other directions, a sphere in muscle, line pairs and a "
         "low-contrast rod, with 200 realisations: hours on two cores, kept piece by piece.",
         "torchpcct dose-factor --task plaque --method mbir --method fbp:soft --n 40",
-        before=_METHODS_TEXT,
+        before=METHODS_TEXT,
         out="folder for report.md, .json, .csv, .html and pictures (default out/dose-factor)",
     )
     parser.set_defaults(
@@ -707,109 +505,3 @@ def add_show_task(commands: Commands) -> None:
         "torchpcct show-task nodule > mine.yaml",
     )
     add_options(parser, ("name", str, "NAME", "", {"nargs": "?"}))
-
-
-def add_compare(commands: Commands) -> None:
-    parser = command(
-        commands,
-        "compare",
-        _own_study,
-        registry.STUDIES["compare"],
-        "Simulate the paper's plaque scan at full size, reconstruct it by FBP, PWLS, the best "
-        "simple filter and MBIR on the same noise realisations at 1× and 5.7× dose, and print "
-        "what dose each saves. After an interruption the same command goes on.",
-        "torchpcct compare --quick",
-        "torchpcct compare --n 200 --methods fbp:soft pwls mbir:fidelity=1",
-        out="folder for report.html, .md, .json and two pictures (default out/compare)",
-    )
-    add_options(
-        parser,
-        ("--n", int, "N", "realisations, at least 8 (default 16)", {"limits": REALISATIONS}),
-        ("--methods", str, "METHOD", "as of evaluate --method", {"nargs": "+"}),
-        ("--quick", bool, None, "reduced views and methods: a first look, some minutes"),
-    )
-    add_execution(parser)
-
-
-def add_hardcases(commands: Commands) -> None:
-    parser = command(
-        commands,
-        "hardcases",
-        _own_study,
-        registry.STUDIES["hardcases"],
-        "Break the plaque's scan in many ways, reconstruct what is left by every method, and "
-        "print the error, the warnings, and whether it was wrong without a warning.",
-        "torchpcct hardcases --quick",
-        "torchpcct hardcases --methods fbp pwls --views 246",
-        out="folder for report.html, .md, .json and the figure (default out/hardcases)",
-    )
-    add_options(
-        parser,
-        ("--quick", bool, None, "an eighth of the views, by FBP alone"),
-        ("--methods", str, "M", "fbp pwls mbir (default: all)", {"nargs": "+"}),
-        ("--cases", str, "NAME", "only these cases", {"nargs": "+"}),
-        (
-            "--views",
-            int,
-            "N",
-            "views of the scan (default 360)",
-            {"limits": {"low": 120, "high": MANY}},
-        ),
-    )
-    add_execution(parser)
-
-
-def add_study(commands: Commands) -> None:
-    listed = "".join(f"  {name:<12} {text}\n" for name, text in registry.STUDIES.items())
-    parser = command(
-        commands,
-        "study",
-        _study,
-        "any study of the paper by its name; torchpcct study --help lists them",
-        "Run a study of the paper at full scale and print its figures beside the published ones. "
-        "After an interruption the same command goes on.",
-        "torchpcct study noise --quick",
-        "torchpcct study motion --set thinning=4",
-        before=f"studies:\n{listed}\n",
-        out="folder for report.html, .md, .json and the figures (default out/NAME)",
-    )
-    add_options(parser, ("name", str, "NAME", "of the study"))
-    add_execution(parser)
-    changes = {"dest": "changes", "action": "append", "default": []}
-    add_options(
-        parser,
-        ("--quick", bool, None, "reduced settings: a first look, < 60 s"),
-        ("--set", str, "FIELD=VALUE", "change a setting (repeatable)", changes),
-    )
-
-
-def add_verify(commands: Commands) -> None:
-    parser = command(
-        commands,
-        "verify",
-        _verify,
-        "do README and RESULTS.md say what the committed reports say?",
-        "Render the results again from the committed reports (notebooks/results.template.md) and "
-        "compare; compute studies again if asked.",
-        "torchpcct verify --write",
-        "torchpcct verify --again phantom",
-    )
-    parser.set_defaults(no_progress=False)
-    add_options(
-        parser,
-        (
-            "--root",
-            Path,
-            None,
-            "folder of the repository (default: this one)",
-            {"default": Path(), "read": True},
-        ),
-        ("--write", bool, None, "write what is rendered"),
-        (
-            "--again",
-            str,
-            "STUDY",
-            "compute these studies again, in full",
-            {"nargs": "*", "default": []},
-        ),
-    )

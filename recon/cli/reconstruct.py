@@ -1,5 +1,4 @@
-"""The commands that make files: ``simulate``, ``show-config``, ``reconstruct``, ``calibrate``,
-``lower-dose``."""
+"""``torchpcct reconstruct``: one scan or many, whole or in slabs, here or on a cluster."""
 
 from __future__ import annotations
 
@@ -8,7 +7,6 @@ import contextlib
 import io
 import json
 import math
-import re
 import shlex
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -16,17 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.parsing import (
-    EXPOSURE,
     LENGTH,
-    MANY,
     PLACE,
-    SCAN_ENDINGS,
+    PLAN_OPTIONS,
     Commands,
-    Parser,
     add_execution,
     add_options,
     as_json,
-    check_ending,
     check_output,
     command,
     executing,
@@ -38,6 +32,13 @@ from recon.cli.parsing import (
     tell,
     without_ending,
 )
+from recon.cli.scan_options import (
+    add_reader_options,
+    grid_of_scan,
+    length,
+    reader_options,
+    require_voxels,
+)
 from recon.names import KERNELS, is_module_name, split_method
 from torchpcct import VolumeGrid
 from torchpcct.files import (
@@ -45,7 +46,6 @@ from torchpcct.files import (
     WriteError,
     atomic_write,
     fingerprint,
-    is_own_hdf5,
     require_folder,
     require_writable,
 )
@@ -56,215 +56,16 @@ if TYPE_CHECKING:
     from recon.jobs.execute import Job
     from recon.slabs import ScanSlices
     from recon.study.study import ProgressBars
-    from torchpcct.acquisition.config import SimulationConfig
     from torchpcct.scan import Scan
-    from torchpcct.scene.voxels import VoxelScene
     from torchpcct.typing import JsonObject
     from torchpcct.volume import Volume
 
-_PAPER_VIEWS = 1968
-"""Views of a turn in the paper."""
-MOST_VOXELS = 2**31
-"""Of a volume, 8 GiB: what is asked for beyond is a slip of the voxel size."""
 _NO_SIZE = " (the file does not know their size: --pitch MM)"
 """Said of a file of unknown pixels."""
 _DONE = ".done"
 """Ending of the note beside a finished volume of many."""
 _FBP_RATE = 1e8
 """Voxel updates of the backprojection a second on one core, for a rough estimate."""
-
-
-# --- simulate -------------------------------------------------------------------------------------
-
-
-def _paper(arguments: argparse.Namespace) -> SimulationConfig:
-    """The paper's plaque scan, from the options alone."""
-    from recon.study.paper.plaque_scan import inset_grid
-    from torchpcct.acquisition.config import SimulationConfig
-    from torchpcct.scanner import presets
-    from torchpcct.scene.plaque import plaque_scene
-
-    scene, plaque = plaque_scene()
-    views = _PAPER_VIEWS if arguments.views is None else arguments.views
-    region = None if arguments.whole else inset_grid(plaque, 0.25)
-    kept = (
-        None
-        if region is None
-        else {
-            "shape": list(region.shape),
-            "spacing": list(region.spacing),
-            "center": list(region.center),
-        }
-    )
-    values = {
-        "scene": {"kind": "plaque"},
-        "scanner": {"preset": "pcct", "views": views},
-        "exposure_s": arguments.exposure,
-        "seed": arguments.seed or 0,
-        "region": kept,
-        "tolerance_hu": 0.5,
-    }
-    return SimulationConfig(
-        scene, presets.pcct(views=views), region, arguments.exposure, values["seed"], 0.5, values
-    )
-
-
-def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
-    check_ending(arguments.out, SCAN_ENDINGS)
-    check_output(arguments, _is_scan, arguments.config, beside=True)
-    if arguments.config is not None and (arguments.views is not None or arguments.whole):
-        raise ValueError(
-            "--views and --whole are the plaque scan's: put views and region into the configuration"
-        )
-    from torchpcct.acquisition.acquire import acquire, plan, readings_key
-    from torchpcct.acquisition.config import read_config
-    from torchpcct.acquisition.kept import ReadingsFolder
-    from torchpcct.scene.voxels import VoxelScene
-
-    if arguments.config is None:
-        config = _paper(arguments)
-    else:
-        config = read_config(arguments.config, exposure_s=arguments.exposure, seed=arguments.seed)
-        check_output(arguments, _is_scan, config.values["scene"].get("file"), beside=True)
-    voxels = isinstance(config.scene, VoxelScene)
-    if arguments.dry_run:
-        import yaml
-
-        print(yaml.safe_dump(config.values, sort_keys=False, allow_unicode=True))
-        print(
-            _voxel_plan(config, config.scene)
-            if isinstance(config.scene, VoxelScene)
-            else plan(
-                config.scene,
-                config.scanner,
-                region=config.region,
-                tolerance_hu=config.tolerance_hu,
-                rotation_s=config.exposure_s,
-            ).table()
-        )
-        return
-    options: dict[str, Any] = (
-        {} if voxels else {"region": config.region, "tolerance_hu": config.tolerance_hu}
-    )
-    if not isinstance(config.scene, VoxelScene) and not arguments.fresh:
-        options["keep"] = ReadingsFolder(
-            readings_key(config.scene, config.scanner, rotation_s=config.exposure_s, **options)
-        )
-    scan = acquire(
-        config.scene,
-        config.scanner,
-        exposure_s=config.exposure_s,
-        seed=config.seed,
-        progress=progress.of("simulate"),
-        **options,
-    )
-    progress.close()
-    scan.save(arguments.out)
-    mean = float(scan.counts.mean())
-    short = (
-        f"{' × '.join(map(str, scan.counts.shape))} readings, mean {mean:.4g}, "
-        f"{scan.info['seconds']} s"
-    )
-    if voxels:
-        short += f"; {_dense(scan.info['plan']['above_muscle'])}"
-    tell(
-        arguments,
-        short,
-        config.values,
-        readings=list(scan.counts.shape),
-        exposure_s=scan.exposure_s,
-        seed=scan.seed,
-        mean_count=mean,
-        **scan.info,
-    )
-
-
-def _is_scan(path: Path) -> bool:
-    return is_own_hdf5(path, "scan")
-
-
-def _voxel_plan(config: SimulationConfig, scene: VoxelScene) -> str:
-    g = config.scanner.geometry
-    readings = math.prod(g.shape)
-    return (
-        f"{readings / 1e6:.2f} M readings of a voxel volume, about {readings * 4 * 2 / 2**30:.2f} "
-        "GiB\n"
-        f"{_dense(scene.above_muscle)}"
-    )
-
-
-def _dense(shares: dict[str, float]) -> str:
-    """What is above muscle, and what it is scanned as."""
-    listed = ", ".join(f"{share:.1%} of the voxels as {name}" for name, share in shares.items())
-    return f"above muscle, scanned (scene.dense): {listed}"
-
-
-_OUTPUT = (
-    ("--dry-run", bool, None, "print the plan, memory and time; compute nothing"),
-    ("--json", bool, None, "print the whole summary as JSON"),
-)
-"""Options of commands that make scans."""
-
-
-def add_simulate(commands: Commands) -> None:
-    parser = command(
-        commands,
-        "simulate",
-        _simulate,
-        "simulate a scan to an HDF5 file",
-        "Simulate a scan of any scene (--config, see show-config) or, without one, of the paper's "
-        "plaque by the deep-silicon PCCT, and write it to HDF5, with what was done beside (.json, "
-        ".yaml).",
-        "torchpcct simulate --exposure 2 --out plaque.h5",
-        "torchpcct show-config > scene.yaml; torchpcct simulate --config scene.yaml --out scan.h5",
-        out="HDF5 file to write",
-        required=True,
-        seed=None,
-    )
-    add_options(
-        parser,
-        ("--config", Path, "YAML", "scene, scanner and exposure", {"read": True}),
-        ("--exposure", float, "S", "exposure in s (default: noise free)", {"limits": EXPOSURE}),
-        (
-            "--views",
-            int,
-            None,
-            f"views per rotation of the plaque scan (default {_PAPER_VIEWS})",
-            {"limits": {"high": MANY}},
-        ),
-        ("--whole", bool, None, "keep the whole detector, not only the plaque's surroundings"),
-        (
-            "--fresh",
-            bool,
-            None,
-            "compute the expected readings, also where an earlier call with another seed kept them",
-        ),
-        *_OUTPUT,
-    )
-
-
-def _show_config(arguments: argparse.Namespace, progress: ProgressBars) -> None:
-    from torchpcct.acquisition.config import EXAMPLE
-    from torchpcct.formats.stack import EXAMPLE as STACK_EXAMPLE
-
-    print(STACK_EXAMPLE if arguments.stack else EXAMPLE, end="")
-
-
-def add_show_config(commands: Commands) -> None:
-    parser = command(
-        commands,
-        "show-config",
-        _show_config,
-        "print a full example for simulate --config, or of a .yaml stack",
-        "Print a full YAML example: for simulate --config, or, with --stack, of a stack of "
-        "projections.",
-        "torchpcct show-config > scene.yaml",
-        "torchpcct show-config --stack > projections.yaml",
-    )
-    add_options(parser, ("--stack", bool, None, "the file beside TIFF or NumPy projections"))
-
-
-# --- reconstruct ----------------------------------------------------------------------------------
 
 
 def _size(text: str) -> str:
@@ -274,185 +75,6 @@ def _size(text: str) -> str:
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is no size such as 4GB or 500MiB") from None
     return text
-
-
-def _slices(text: str) -> slice:
-    """``A:B`` of a command line, either end left out."""
-    found = re.fullmatch(r"\s*(\d*):(\d*)\s*", text)
-    if not found or found[1] == found[2] == "":
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not A:B, the first slice and the one after the last, from 0"
-        )
-    first, stop = (int(end) if end else None for end in found.groups())
-    if first is not None and stop is not None and first >= stop:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} holds no slice: the second number must be the larger one"
-        )
-    return slice(first, stop)
-
-
-def add_reader_options(parser: Parser, many: bool = False) -> None:
-    """The scan, or many of them, and what its file may not know, see :func:`reader_options`."""
-    nargs = {"nargs": "+"} if many else {"read": True}
-    formats = (
-        ".h5 (ours, Data Exchange, NeXus), .yaml stack, .xtekct, .txrm, .mat, CatSim, "
-        "DICOM-CT-PD folder"
-    )
-    add_options(parser, ("scan", Path, "SCAN", formats, nargs))
-    add_options(
-        parser,
-        (
-            "--geometry",
-            Path,
-            "YAML",
-            "geometry of files that do not hold it; one with kind: vectors, kind: rtk or "
-            "pose: takes the place of the file's own",
-            {"read": True},
-        ),
-        (
-            "--mu-water",
-            float,
-            "MM⁻¹",
-            "attenuation of water; with it the volume is in HU",
-            {"limits": {**LENGTH, "unit": "mm⁻¹"}},
-        ),
-        (
-            "--axis",
-            float,
-            "COLUMN",
-            "where the rotation axis projects to, counted from 0",
-            {"limits": {"low": 0.0, "high": 1e6}},
-        ),
-        (
-            "--pitch",
-            float,
-            "MM",
-            "cell width of parallel beams, where the file does not hold it",
-            {"limits": LENGTH},
-        ),
-        (
-            "--photons",
-            float,
-            "N",
-            "photons of an unattenuated reading, of scans given as line integrals",
-            {"limits": {"positive": True, "high": 1e18}},
-        ),
-        ("--slices", _slices, "A:B", "read only these slices (parallel, fan) or rows (cone beam)"),
-        (
-            "--angles-deg",
-            _angles,
-            "FILE|START:STEP",
-            "angles of Data Exchange and NeXus in degrees: a text file with one a line, or the "
-            "first and their step",
-        ),
-        (
-            "--air",
-            _number_or_file,
-            "N|FILE",
-            "reading without the object, of files that hold none: a number, or .tif, "
-            ".npy, a pattern",
-        ),
-        ("--dark", _number_or_file, "N|FILE", "reading without beam, as --air"),
-        ("--entry", str, "NAME", "of a NeXus file with several scans"),
-        ("--variable", str, "NAME", "of a MATLAB file with several arrays"),
-        (
-            "--spot",
-            int,
-            "K",
-            "of a flying focal spot: only the views from its position K",
-            {"limits": {"low": 0, "high": 63}},
-        ),
-        group="what the file does not know of its scan",
-    )
-
-
-def _number_or_file(text: str) -> float | str:
-    """A number, or a file or pattern by its full path: workers may stand in another folder."""
-    try:
-        value = float(text)
-    except ValueError:
-        return _there(text)
-    if not math.isfinite(value) or value < 0:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is no reading: a finite number of 0 or more, or a file"
-        )
-    return value
-
-
-def _there(text: str) -> str:
-    """A file that is there, or a pattern, by its full path."""
-    path = Path(text).absolute()
-    if not text.strip():
-        raise argparse.ArgumentTypeError("it is empty")
-    if not path.exists() and not any(c in text for c in "*?["):
-        raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor a file that is there")
-    return str(path)
-
-
-def _angles(text: str) -> dict[str, float] | str:
-    """``START:STEP`` in degrees, or a text file by its full path."""
-    try:
-        start, step = map(float, text.split(":"))
-    except ValueError:
-        return _there(text)
-    if not math.isfinite(start) or not math.isfinite(step) or step == 0:
-        raise argparse.ArgumentTypeError(f"{text!r}: start and step must be finite, the step not 0")
-    return {"start": start, "step": step}
-
-
-_READ_WITH = (
-    "axis",
-    "pitch",
-    "mu_water",
-    "photons",
-    "angles_deg",
-    "air",
-    "dark",
-    "entry",
-    "variable",
-    "spot",
-)
-"""Options that a scan's file is read with."""
-
-
-def reader_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What the command line says of the scan's file beside it."""
-    given = {name: getattr(arguments, name) for name in _READ_WITH}
-    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    if arguments.slices is not None:
-        options["slices"] = arguments.slices
-    if arguments.geometry is not None:
-        from torchpcct.formats.damage import read_yaml, reading
-        from torchpcct.formats.geometry_yaml import geometry_of
-
-        values = read_yaml(arguments.geometry, "a geometry")
-        with reading(arguments.geometry, "a geometry"):
-            options["geometry"] = geometry_of(values, arguments.geometry.parent)
-    return options
-
-
-def grid_of_scan(scan: Scan | ScanSlices, arguments: argparse.Namespace) -> VolumeGrid:
-    """The grid that was asked for, see :meth:`torchpcct.VolumeGrid.of`."""
-    return VolumeGrid.of(
-        scan, voxel=arguments.voxel, extent=arguments.extent, center=arguments.center
-    )
-
-
-def _length(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is no length in mm (a file stands before this option)"
-        ) from None
-
-
-def _require_voxels(shape: tuple[int, ...]) -> None:
-    if math.prod(shape) > MOST_VOXELS:
-        raise ValueError(
-            f"--voxel makes {' × '.join(map(str, shape))} voxels, more than {MOST_VOXELS:.0e}: "
-            "enlarge the voxels, or reconstruct a smaller --extent"
-        )
 
 
 _MAP = "drawn_minus_plain_hu"
@@ -669,7 +291,7 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
                 f"--{name} must be three numbers, Z Y X, of slices two, Y X; got {len(given)}"
             )
     if arguments.voxel is not None and not slabs:
-        _require_voxels(
+        require_voxels(
             tuple(math.ceil(e / arguments.voxel) for e in arguments.extent or (1.0, 1.0, 1.0))
         )
     if not arguments.scan.exists():
@@ -700,7 +322,7 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
 
         scan = cleaned(scan)
     grid = grid_of_scan(scan, arguments)
-    _require_voxels(grid.shape)
+    require_voxels(grid.shape)
     check_target(arguments.out, grid.voxels, scan.unit)
     config = _config(arguments, scan, grid, options)
     if arguments.dry_run:
@@ -954,14 +576,14 @@ def add_reconstruct(commands: Commands) -> None:
         ),
         (
             "--center",
-            _length,
+            length,
             "MM",
             f"centre, Z Y X (default: region or axis); {own}",
             {"nargs": "+", "limits": PLACE},
         ),
         (
             "--extent",
-            _length,
+            length,
             "MM",
             f"edge lengths, Z Y X (default: what is seen); {own}",
             {"nargs": "+", "limits": LENGTH},
@@ -988,169 +610,5 @@ def add_reconstruct(commands: Commands) -> None:
         ("--clean", bool, None, "take out stripes and outliers (parallel and fan beams)"),
         group="corrections of the scan",
     )
-    add_options(parser, *_OUTPUT)
+    add_options(parser, *PLAN_OPTIONS)
     add_execution(parser, dry_run=False)
-
-
-# --- calibrate ------------------------------------------------------------------------------------
-
-
-_CALIBRATED = "# torchpcct calibrate: "
-"""How a geometry begins that ``calibrate`` has written."""
-
-
-def _calibrate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
-    if arguments.out is None:
-        arguments.out = Path(f"{without_ending(arguments.scan)}_geometry.yaml")
-    check_ending(arguments.out, (".yaml", ".yml"))
-    check_output(arguments, _is_calibrated, arguments.scan, arguments.geometry)
-    import yaml
-
-    from recon.calibration import calibrate
-    from torchpcct.formats.geometry_yaml import geometry_values
-    from torchpcct.formats.scans import open_scan
-    from torchpcct.vector_geometry import VectorGeometry
-
-    scan = open_scan(arguments.scan, **reader_options(arguments))
-    grid = grid_of_scan(scan, arguments)
-    _require_voxels(grid.shape)
-    names = None
-    if arguments.free is not None:
-        names = [name.strip() for name in arguments.free.split(",") if name.strip()]
-    found = calibrate(scan, grid, names, progress=progress.of("calibrate"))
-    progress.close()
-    # Vectors, which take the place of what a file says of itself.
-    made = found.geometry
-    vectors = made if isinstance(made, VectorGeometry) else VectorGeometry.of(made)
-    about = [f"{_CALIBRATED}{arguments.scan.name}", *str(found).splitlines()]
-    text = "\n# ".join(about) + "\n"
-    text += yaml.safe_dump(geometry_values(vectors), sort_keys=False, default_flow_style=None)
-    with atomic_write(arguments.out) as part:
-        part.write_text(text, encoding="utf-8")
-    if arguments.json:
-        print(as_json({"file": str(arguments.out), **found.report()}))
-        return
-    print(found)
-    print(
-        f"{arguments.out}: torchpcct reconstruct {shlex.quote(str(arguments.scan))} "
-        f"--geometry {shlex.quote(str(arguments.out))}"
-    )
-
-
-def _is_calibrated(path: Path) -> bool:
-    try:
-        with path.open(encoding="utf-8") as file:
-            return file.readline().startswith(_CALIBRATED)
-    except (OSError, ValueError):
-        return False
-
-
-def add_calibrate(commands: Commands) -> None:
-    parser = command(
-        commands,
-        "calibrate",
-        _calibrate,
-        "find a scan's geometry from the object itself",
-        "Find numbers of a scan's geometry from its readings, with standard errors, and write the "
-        "geometry for reconstruct --geometry. The whole object must be seen in all views. What "
-        "the readings do not determine is refused.",
-        "torchpcct calibrate tooth.h5 --free offset,roll --out tooth.yaml",
-        "torchpcct reconstruct tooth.h5 --geometry tooth.yaml --out tooth.nii.gz",
-        out="geometry to write, .yaml (default SCAN_geometry.yaml)",
-    )
-    add_options(
-        parser,
-        (
-            "--free",
-            str,
-            "NAMES",
-            "what to find, of offset (the detector's, along the columns), axis (off the line from "
-            "the source that meets the detector upright), row_offset, roll, tilt, slant, sdd, "
-            "with commas (default offset, of a detector with rows offset,roll)",
-        ),
-    )
-    own = "for separate slices only Y X"
-    add_options(
-        parser,
-        (
-            "--voxel",
-            float,
-            "MM",
-            "voxel size (default: of a detector cell at the axis)",
-            {"limits": LENGTH},
-        ),
-        (
-            "--center",
-            _length,
-            "MM",
-            f"centre, Z Y X (default: the axis); {own}",
-            {"nargs": "+", "limits": PLACE},
-        ),
-        (
-            "--extent",
-            _length,
-            "MM",
-            f"edge lengths, Z Y X (default: what is seen); {own}",
-            {"nargs": "+", "limits": LENGTH},
-        ),
-        group="voxels",
-    )
-    add_reader_options(parser)
-    add_options(parser, ("--json", bool, None, "print all numbers as JSON"))
-
-
-# --- lower-dose -----------------------------------------------------------------------------------
-
-
-def _lower_dose(arguments: argparse.Namespace, progress: ProgressBars) -> None:
-    if arguments.out is None:
-        arguments.out = Path(f"{without_ending(arguments.scan)}_{arguments.fraction:g}.h5")
-    check_ending(arguments.out, SCAN_ENDINGS)
-    check_output(arguments, _is_scan, arguments.scan, arguments.geometry, beside=True)
-    from torchpcct.formats.geometry_yaml import geometry_values
-    from torchpcct.formats.scans import open_scan
-
-    scan = open_scan(arguments.scan, **reader_options(arguments)).at_dose(
-        arguments.fraction, arguments.seed
-    )
-    scan.save(arguments.out)
-    note = scan.info["lower_dose"]
-    how = (
-        "photons thinned, exact"
-        if note["exact"]
-        else "mean and variance right, higher moments approximate"
-    )
-    short = (
-        f"{' × '.join(map(str, scan.counts.shape))} readings at {arguments.fraction:g} of the "
-        f"dose ({how})"
-    )
-    config = {"scan": str(arguments.scan), "geometry": geometry_values(scan.geometry), **note}
-    tell(
-        arguments,
-        short,
-        config,
-        readings=list(scan.counts.shape),
-        exposure_s=scan.exposure_s,
-        **note,
-    )
-
-
-def add_lower_dose(commands: Commands) -> None:
-    parser = command(
-        commands,
-        "lower-dose",
-        _lower_dose,
-        "a measured scan as if it had been taken with less dose",
-        "Write a scan, ours or a foreign one, as it would have been at a fraction of its dose, "
-        "noise included. Photon counts are thinned, which is exact; other readings get the right "
-        "mean and variance. Refused where the number of photons is not known.",
-        "torchpcct lower-dose scan.h5 --fraction 0.25 --out quarter.h5",
-        out="HDF5 file to write (default SCAN_FRACTION.h5)",
-    )
-    add_reader_options(parser)
-    limits = {"positive": True, "high": 1.0}
-    add_options(
-        parser,
-        ("--fraction", float, "F", "of the dose, 0 < F ≤ 1", {"required": True, "limits": limits}),
-        ("--json", bool, None, "print the whole summary as JSON"),
-    )
