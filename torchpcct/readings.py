@@ -50,6 +50,8 @@ _NO_PHOTONS = 0.1
 """Variance over mean below which what was read are no photons."""
 _NO_COUNTS = 2.0
 """Readings in air that cannot be counts: transmissions."""
+_MUCH = 0.3
+"""Standard deviation of readings over those in air that ten photons have, and no transmissions."""
 DIM = 20.0
 """Photons of a reading below which its noise is far from normal."""
 TRANSFER_FRAMES = 4
@@ -242,6 +244,7 @@ def _gain(
     frames: Tensor | None,
     dark: Tensor,
     geometry: Geometry,
+    electronic_noise: float | None,
 ) -> tuple[float, str]:
     """Signal of one photon, and where it is from; see ``Scan.from_counts``."""
     if given is None and (frames is None or len(frames) < TRANSFER_FRAMES):
@@ -250,6 +253,8 @@ def _gain(
         if noise < _NO_PHOTONS:
             return max(noise, 1e-8 * level), "noise between neighbours"
         if math.isnan(noise) and 0 < level < _NO_COUNTS and not _whole(signal):
+            if electronic_noise or _of_few_photons(signal, level):
+                return 1.0, "assumed"
             return 1e-6 * level, "assumed of transmissions"
         return 1.0, "assumed"
     if given is None:
@@ -281,7 +286,9 @@ def counted(
     if not float((bright - black).nanmedian()) > 0:
         raise ValueError("air is not brighter than dark: are the two exchanged?")
     signal = raw - _views(black, geometry)
-    gain, source = _gain(gain, signal, bright - black, bright_frames, black, geometry)
+    gain, source = _gain(
+        gain, signal, bright - black, bright_frames, black, geometry, electronic_noise
+    )
     if electronic_noise is None:
         frames = black_frames if black_frames is not None and len(black_frames) > 2 else None
         electronic_noise = 0.0 if frames is None else float(frames.var(0).mean().sqrt()) / gain
@@ -317,6 +324,16 @@ def counted(
     if flux is not None:
         fields["flux"] = _flux(flux, geometry)
     return fields
+
+
+def _of_few_photons(signal: Tensor, level: float) -> bool:
+    """Whether neighbours scatter by so much of the ``level`` in air as a handful of photons do, or
+    electronics beside them, and no transmissions."""
+    second = (signal[..., 2:] - 2.0 * signal[..., 1:-1] + signal[..., :-2]).abs()
+    second = second[torch.isfinite(second)]
+    if second.numel() < 8:
+        return False
+    return float(second.median()) * MEDIAN_TO_SD / math.sqrt(6.0) > _MUCH * level
 
 
 def _whole(signal: Tensor) -> bool:

@@ -36,6 +36,15 @@ _CUT_RANGES = 40
 """Ranges of the views over which the ends are averaged."""
 _CUT_FEWEST = 12
 """The fewest of them, where there is more noise."""
+_CUT_SIGMAS = 3.5
+"""Standard errors by which a mean must lie above the limit."""
+_CUT_PARTS = (6, 3)
+"""Parts of the turn over which the ends are averaged, too: of few photons no less tells."""
+_CUT_WIDE_SIGMAS = 4.5
+"""Standard errors for those, few of which are independent: the noise of the air frames is in all
+views alike."""
+_CUT_OUTLIER = 6.0
+"""Standard deviations of a step between views beyond which it is none of the noise."""
 _LEFT_OUT = 0.1
 """Weight relative to the other end below which an end does not count."""
 _FEWEST_COLUMNS = 4
@@ -107,20 +116,32 @@ def _rises(end: Tensor, limit: float) -> bool:
 
     An object is cut off over ranges of views; noise is not: means over a fortieth of the turn are
     compared, or over as much more, up to a twelfth, as makes their noise a third of the limit, with
-    a margin of three of their standard errors. Logarithms of few photons have far outliers.
+    a margin of :data:`_CUT_SIGMAS` of their standard errors; and means over :data:`_CUT_PARTS` of
+    the turn with a larger one. Logarithms of few photons have far outliers, which the median of
+    the steps between views does not know of: their variance counts, those of single lost readings
+    left out.
     """
     series = end.reshape(-1, 1, end.shape[-1]).double()
     views = series.shape[-1]
     width, sd = max(1, views // _CUT_RANGES), 0.0
     if views > 2:
-        sd = float(series.diff(dim=-1).abs().median()) * MEDIAN_TO_SD / math.sqrt(2.0)
+        steps = series.diff(dim=-1)
+        usual = float(steps.abs().median()) * MEDIAN_TO_SD
+        steps = steps.clamp(-_CUT_OUTLIER * usual, _CUT_OUTLIER * usual)
+        sd = max(usual, float(steps.square().mean().sqrt())) / math.sqrt(2.0)
         enough = math.ceil(min((3.0 * sd / limit) ** 2, views))
         width = max(width, min(views // _CUT_FEWEST, enough))
-    smooth = torch.nn.functional.avg_pool1d(series, width, 1)
-    margin = 3.0 * sd / math.sqrt(width)
+
+    def share(width: int, sigmas: float) -> float:
+        smooth = torch.nn.functional.avg_pool1d(series, width, 1)
+        return float((smooth > limit + sigmas * sd / math.sqrt(width)).double().mean())
+
     # One outlier lifts all means that it is in.
-    least = max(_CUT_VIEWS, 1.25 * width / smooth.shape[-1])
-    return float((smooth > limit + margin).double().mean()) > least
+    least = max(_CUT_VIEWS, 1.25 * width / (views - width + 1))
+    if share(width, _CUT_SIGMAS) > least:
+        return True
+    wide = [views // part for part in _CUT_PARTS if views // part > width]
+    return any(share(n, _CUT_WIDE_SIGMAS) > _CUT_VIEWS for n in wide)
 
 
 def _room(geometry: Beam) -> tuple[int, int]:

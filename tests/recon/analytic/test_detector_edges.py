@@ -10,10 +10,11 @@ import torch
 from analytic import Ellipsoid, Gaussian, line_integrals
 
 from recon.analytic.angular_weights import angular_weights, offset_share
-from recon.analytic.detector_edges import Rows, continued, cut_off
+from recon.analytic.detector_edges import Rows, continued, cut_off, ends_cut_off
 from recon.analytic.fbp import fbp
 from torchpcct.angles import is_offset
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
+from torchpcct.scan import Scan
 
 MU = 0.02
 BODY = (
@@ -210,3 +211,27 @@ def test_noise_of_few_photons_in_air_is_no_object_beyond_the_row():
         told.append([cut_off(torch.from_numpy(np.log(p)), g, weights) for p in lines])
     assert sum(any(t[0]) for t in told) == 0
     assert sum(t[1] == (False, True) for t in told[::2]) > 100
+
+
+@pytest.mark.parametrize(("photons", "noise"), [(7.0, 3.2), (4.0, 2.0)])
+def test_noise_of_fewer_photons_than_the_electronics_add_is_none_either(photons, noise):
+    """Their logarithms have outliers that the median of the steps between views does not show."""
+    geometry = ParallelBeam(full_turn(236), 9, 1.4)
+    clear = np.zeros((400, 236, 9))
+    clear[..., 3:6] = 0.5
+    cut = clear.copy()
+    cut[:, 59:141, -3:] = 0.7
+    rng, told = np.random.default_rng(0), []
+    for p in (clear, cut):
+        readings = rng.poisson(photons * np.exp(-p)) + noise * rng.standard_normal(p.shape)
+        scan = Scan.from_counts(
+            readings, geometry, air=photons, dark=np.zeros(9), electronic_noise=noise
+        )
+        told.append(
+            [
+                ends_cut_off(1.0, lines[:, 0], lines[:, -1], geometry, np.ones((236, 1)))
+                for lines in scan.line_integrals()
+            ]
+        )
+    assert sum(first + last for first, last in told[0]) <= 4
+    assert sum(ends == (False, True) for ends in told[1]) >= 395

@@ -69,6 +69,20 @@ def test_transmissions_are_no_counts():
         assert torch.equal(scan.counts, torch.from_numpy(low).float())
 
 
+@pytest.mark.parametrize("known", [5.0, None])
+def test_a_photon_or_two_under_electronic_noise_are_counts_too(known):
+    """They were taken for transmissions of a million photons."""
+    rng = np.random.default_rng(0)
+    n, dark = rng.normal(counted(air=1.8), 5.0), rng.normal(0.0, 5.0, (400, 160))
+    scan = Scan.from_counts(n, FAN, air=1.8, dark=dark, electronic_noise=known)
+    assert scan.info["signal_of_one_photon"] == 1.0
+    assert float(scan.air.mean()) == pytest.approx(1.8, abs=0.1)
+    # Transmissions of a scan that is too small to tell their noise stay what they are.
+    two = ParallelBeam(np.zeros(2), 4, 1.0)
+    few = Scan.from_counts(np.exp(-np.linspace(0.0, 1.0, 8).reshape(2, 4)), two, air=1.0)
+    assert few.info["signal_of_one_photon_from"] == "assumed of transmissions"
+
+
 def test_the_gain_is_that_of_air_frames_however_uneven_the_field():
     """Behind a bowtie one photon was 1.7: each frame was divided by the reading of one cell."""
     profile = np.exp(-1.5 * np.linspace(-1, 1, FAN.columns) ** 2)
