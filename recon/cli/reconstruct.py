@@ -361,8 +361,8 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
 
 
 def _is_path_table(path: Path) -> bool:
-    """Whether a file is a table of a path, as :func:`recon.motion_path.path_table` writes it."""
-    from recon.motion_path import TABLE_HEADER
+    """Whether a file is a table of a path, as :func:`recon.motion.path_table` writes it."""
+    from recon.motion.path import TABLE_HEADER
 
     with path.open("rb") as file:
         return file.read(200).split(b"\n")[0].decode("utf-8", "replace") == ",".join(TABLE_HEADER)
@@ -370,7 +370,7 @@ def _is_path_table(path: Path) -> bool:
 
 def _with_path(volume: Volume, table: Path, picture: Path) -> Volume:
     """The volume with the names of the files in its report to which its path was written."""
-    from recon.motion_path import path_figure, path_table
+    from recon.motion import path_figure, path_table
 
     motion = volume.report["motion"]
     with atomic_write(table) as part:

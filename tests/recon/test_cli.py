@@ -389,7 +389,7 @@ def test_a_path_is_written_beside_the_volume(here, cli, clean, monkeypatch):
     clean.with_noise(1.0, 0).save("mine.h5")
     still = np.zeros((clean.geometry.views, 3))
     found = InsetMotion(still, still + 0.02, True, 9.0, 0.1, (1.0, 1.0), 2)
-    monkeypatch.setattr("recon.motion.estimate_motion", lambda scan, grid: found)
+    monkeypatch.setattr("recon.motion.estimate.estimate_motion", lambda scan, grid: found)
     (here / "a_motion.csv").write_text("my own", encoding="utf-8")
     assert "a_motion.csv exists" in cli("reconstruct mine.h5 --motion estimate --out a.mha", 2)
     assert (here / "a_motion.csv").read_text(encoding="utf-8") == "my own"

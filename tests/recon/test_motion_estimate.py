@@ -11,19 +11,14 @@ import torch
 from refusals import refused
 
 import recon
-import recon.motion
+import recon.motion.estimate
 from recon.analytic.coverage import _at_rest, consistency_warnings
 from recon.analytic.inset import InsetFbp, view_motion
 from recon.least_squares.inset_problem import InsetProblem
-from recon.motion import (
-    _about,
-    _basis,
-    _believed,
-    _Found,
-    _likelihood,
-    _MotionProblem,
-    estimate_motion,
-)
+from recon.motion import PathTooLongError, estimate_motion
+from recon.motion.belief import believed, likelihood_of
+from recon.motion.estimate import _about, _Found
+from recon.motion.problem import MotionProblem, basis_of
 from recon.study.motion_found import AlongAxis, JumpMotion
 from recon.study.paths import KINDS, true_path
 from recon.variable_projection import Normal
@@ -158,11 +153,9 @@ def test_a_jump_is_found_and_said():
 def test_a_path_far_along_the_axis_is_refused(monkeypatch):
     scan = _scan(AlongAxis("vessel", 0.8)).with_noise(EXPOSURE_S, 0)
     path = estimate_motion(scan, GRID).path
-    assert 0.2 < np.abs(path[:, 0]).max() < recon.motion._REACH_ALONG_MM
-    monkeypatch.setattr(recon.motion, "_REACH_ALONG_MM", 0.1)
-    with pytest.raises(
-        recon.motion.PathTooLongError, match=r"along the axis, more than the 0\.1 mm"
-    ):
+    assert 0.2 < np.abs(path[:, 0]).max() < recon.motion.estimate._REACH_ALONG_MM
+    monkeypatch.setattr(recon.motion.estimate, "_REACH_ALONG_MM", 0.1)
+    with pytest.raises(PathTooLongError, match=r"along the axis, more than the 0\.1 mm"):
         estimate_motion(scan, GRID)
 
 
@@ -201,7 +194,7 @@ def test_errors_cover_what_noise_does(moving):
 @pytest.mark.extended
 def test_a_beating_heart(moving, monkeypatch):
     """It does not jump: nothing of the kind is looked for."""
-    monkeypatch.setattr("recon.motion._with_jump", None)
+    monkeypatch.setattr("recon.motion.estimate._with_jump", None)
     beat = SinusoidalMotion("vessel", 0.8, rate_bpm=100.0, direction=1.0)
     scan = _scan(beat).with_noise(EXPOSURE_S, 0)
     found = estimate_motion(scan, GRID, heart_rate=100.0, rotation_s=TURN_S)
@@ -219,7 +212,7 @@ def test_what_the_readings_leave_open_stays_open():
         truth = 0.3 * rng.standard_normal(18) * np.repeat([0.3, 1.0, 1.0], 6)
         information = np.diag(seen**-2.0)
         pull = truth / seen**2 + rng.standard_normal(18) / seen
-        found = _believed(Normal(information, pull, information, 1.0), np.zeros((6, 3)), 1.0)
+        found = believed(Normal(information, pull, information, 1.0), np.zeros((6, 3)), 1.0)
         off = found.mean.T.ravel() - truth
         inside.append(np.abs(off) <= 2.0 * np.sqrt(np.diag(found.covariance)))
     assert 0.9 < np.mean(inside) < 0.995
@@ -229,10 +222,10 @@ def test_what_the_readings_leave_open_stays_open():
 def test_loops_are_covered(moving):
     """Drawn in the equations of one scan, whose noise they have: 95 % within two errors, of all
     together."""
-    problem = _MotionProblem(moving.with_noise(EXPOSURE_S, 0), GRID, None)
+    problem = MotionProblem(moving.with_noise(EXPOSURE_S, 0), GRID, None)
     at = np.linalg.lstsq(problem.basis, _truth(moving)[1], rcond=None)[0]
     seen = problem.at(at)[0]
-    precision = _likelihood(seen, at, problem.inflation)[0]
+    precision = likelihood_of(seen, at, problem.inflation)[0]
     rng = np.random.default_rng(0)
     noise = np.linalg.cholesky(precision + 1e-9 * np.trace(precision) * np.eye(len(precision)))
     inside, off = [], []
@@ -240,7 +233,7 @@ def test_loops_are_covered(moving):
         path = true_path(KINDS["loops"](rng), moving)
         pull = precision @ np.linalg.lstsq(problem.basis, path, rcond=None)[0].T.ravel()
         pull += noise @ rng.standard_normal(len(pull))
-        found = _believed(Normal(precision, pull, precision, 1.0), 0.0 * at, 1.0)
+        found = believed(Normal(precision, pull, precision, 1.0), 0.0 * at, 1.0)
         errors = problem.errors(found.covariance)
         off.append((problem.path(found.mean) - path) / errors)
         inside.append(np.mean(np.abs(off[-1]) <= 2.0))
@@ -251,14 +244,14 @@ def test_loops_are_covered(moving):
 def test_a_jump_is_told_from_a_smooth_path():
     """Of noisy displacements along one axis in every view."""
     rng, times = np.random.default_rng(0), np.linspace(0.0, 1.0, 60)
-    smooth = _basis(times, None)
+    smooth = basis_of(times, None)
     late = (times > 0.4) - np.mean(times > 0.4)
     columns = np.column_stack([smooth, late])
     seen = np.kron(np.eye(3), columns.T @ columns) / 0.05**2
     for path, jumps in ((0.3 * smooth[:, 0] - 0.2 * smooth[:, 2], False), (0.3 * late, True)):
         drawn = np.outer([0.0, 0.6, 0.8], path) + 0.05 * rng.standard_normal((3, 60))
         pull = (drawn @ columns).ravel() / 0.05**2
-        found = _believed(Normal(seen, pull, seen, 1.0), np.zeros((7, 3)), 1.0, jumps=True)
+        found = believed(Normal(seen, pull, seen, 1.0), np.zeros((7, 3)), 1.0, jumps=True)
         assert (found.gain > 8.0) is jumps
         assert found.mean[-1] == pytest.approx([0.0, 0.18 * jumps, 0.24 * jumps], abs=0.07)
         off = columns @ found.mean - np.outer(path, [0.0, 0.6, 0.8])
@@ -284,14 +277,14 @@ def test_a_jump_has_the_view_the_size_and_the_errors_of_its_coefficients():
 
 def test_a_jump_of_averaged_views_is_one_between_two_of_the_scan():
     averaged = SimpleNamespace(_averaging=np.kron(np.eye(4), np.full(2, 0.5)))
-    assert _MotionProblem.first_view(averaged, 2) == 4
-    assert _MotionProblem.late(averaged, 2) == pytest.approx([-0.5] * 4 + [0.5] * 4)
-    assert _MotionProblem.late(averaged, 3) == pytest.approx([-0.25] * 6 + [0.75] * 2)
+    assert MotionProblem.first_view(averaged, 2) == 4
+    assert MotionProblem.late(averaged, 2) == pytest.approx([-0.5] * 4 + [0.5] * 4)
+    assert MotionProblem.late(averaged, 3) == pytest.approx([-0.25] * 6 + [0.75] * 2)
 
 
 def test_a_jump_at_the_same_view_is_no_gain(moving):
     """Nor are views before the first and behind the last asked for."""
-    problem = _MotionProblem(moving.with_noise(EXPOSURE_S, 0), GRID, None).with_jump(24)
+    problem = MotionProblem(moving.with_noise(EXPOSURE_S, 0), GRID, None).with_jump(24)
     at = np.zeros((problem.basis.shape[1], 3))
     effects = problem.at(at)[1]
     same, other = problem.gains([24, 12], at, effects)
@@ -303,7 +296,7 @@ def test_a_jump_at_the_same_view_is_no_gain(moving):
 
 
 def test_voxels_are_no_larger_than_cells(moving):
-    coarse = _MotionProblem(moving, VolumeGrid((4, 7, 7), 1.0, GRID.center), None)
+    coarse = MotionProblem(moving, VolumeGrid((4, 7, 7), 1.0, GRID.center), None)
     assert max(coarse.grid.spacing) == pytest.approx(moving.geometry.cell)
 
 

@@ -6,8 +6,8 @@ import io
 import numpy as np
 import pytest
 
-from recon.motion import InsetMotion, Jump
-from recon.motion_path import TABLE_HEADER, path_figure, path_table
+from recon.motion import InsetMotion, Jump, path_figure, path_table
+from recon.motion.path import TABLE_HEADER
 
 
 def _motion(**changes):

@@ -1,9 +1,10 @@
-"""The path of an inset as a table and as a picture, from what a volume's report says of it."""
+"""The path of an inset: what an estimate gives, and as a table and a picture."""
 
 from __future__ import annotations
 
 import csv
 import io
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,13 +14,94 @@ if TYPE_CHECKING:
 
     from torchpcct.typing import Floats, JsonObject
 
-__all__ = ["TABLE_HEADER", "path_figure", "path_table"]
+__all__ = ["TABLE_HEADER", "InsetMotion", "Jump", "PathTooLongError", "path_figure", "path_table"]
 
 TABLE_HEADER = ("view", "z_mm", "y_mm", "x_mm", "z_error_mm", "y_error_mm", "x_error_mm")
 """Columns of :func:`path_table`."""
 
 _AXES = ("z", "y", "x")
 """In the order of a path."""
+
+
+class PathTooLongError(ValueError):
+    """The inset moves further than is looked for, or too little of it can be seen to tell."""
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A displacement at once.
+
+    Attributes:
+        view: first view of the scan after it.
+        mm: ``(3,)`` z, y, x.
+        errors: ``(3,)`` standard errors.
+    """
+
+    view: int
+    mm: Floats
+    errors: Floats
+
+    @property
+    def length(self) -> float:
+        """Of the displacement, mm."""
+        return float(np.linalg.norm(self.mm))
+
+    @property
+    def error(self) -> float:
+        """Standard error of :attr:`length`."""
+        return float(np.linalg.norm(self.mm * self.errors)) / max(self.length, 1e-12)
+
+    def report(self) -> JsonObject:
+        """All numbers, for JSON."""
+        return {
+            "view": self.view,
+            "mm": np.round(self.mm, 4).tolist(),
+            "errors_mm": np.round(self.errors, 4).tolist(),
+        }
+
+
+@dataclass(frozen=True)
+class InsetMotion:
+    """Result of :func:`estimate_motion`.
+
+    Attributes:
+        path: ``(views, 3)`` z, y, x mm, displacement of the inset in every view of the scan, of
+            mean zero; zeros if no motion is held.
+        errors: ``(views, 3)`` standard errors of the path that was found, applied or not.
+        held: whether the readings hold a motion.
+        evidence: logarithm of the marginal likelihood of the motion over that of rest.
+        rms_mm: root mean square displacement of the path that was found, applied or not.
+        misfit: what is left of the smoothed readings over their noise, root mean square, at rest
+            and along ``path``.
+        steps: iterations done.
+        warnings: what restrains trust in the result.
+        jump: that the path has, if the readings hold one; None: the path is smooth.
+    """
+
+    path: Floats
+    errors: Floats
+    held: bool
+    evidence: float
+    rms_mm: float
+    misfit: tuple[float, float]
+    steps: int
+    warnings: list[str] = field(default_factory=list)
+    jump: Jump | None = None
+
+    def report(self) -> JsonObject:
+        """All numbers, for JSON."""
+        return {
+            "held": self.held,
+            "rms_mm": self.rms_mm,
+            "evidence": self.evidence,
+            "misfit": list(self.misfit),
+            "steps": self.steps,
+            "path_mm": np.round(self.path, 4).tolist(),
+            "errors_mm": np.round(self.errors, 4).tolist()
+            if np.isfinite(self.errors).all()
+            else None,
+            "jump": None if self.jump is None else self.jump.report(),
+        }
 
 
 def path_table(motion: JsonObject) -> str:
