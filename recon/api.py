@@ -215,15 +215,15 @@ def reconstruct(
     twice = sorted(named.keys() & options.keys())
     if twice:
         raise TypeError(
-            f"{', '.join(twice)} stands in the method {method!r} and beside it: leave out one of "
-            "them"
+            f"{', '.join(twice)} is given in the method {method!r} and as an argument: leave out "
+            "one of them"
         )
     if "weights" in named:
         from recon.mbir.mbir import Mbir
 
         if "network" in options:
             raise TypeError(
-                f"network stands beside the weights of the method {method!r}: leave out one of them"
+                f"network is given as well as the weights of the method {method!r}: leave out one"
             )
         named["network"] = Mbir.load(named.pop("weights"), network=named.pop("network", None))
     chosen: dict[str, Any] = {**named, **options}
@@ -271,7 +271,7 @@ def _moving(
 
     if chosen.get("problem") is not None:
         raise ValueError(
-            "a problem stands beside motion: give problem.with_motion(path), or motion alone"
+            "problem and motion are both given: give problem.with_motion(path), or motion alone"
         )
     if scan.window is None:
         raise ValueError(
@@ -429,6 +429,6 @@ def _mbir(
         from recon.vessel.known import known_vessel
 
         if known is not None:
-            raise TypeError("known stands beside vessel or tissues: leave out one of them")
+            raise TypeError("known is given as well as vessel or tissues: leave out one of them")
         known = known_vessel(vessel, tissues, point, vessel_prior)
     return reconstruct_mbir(scans, grid, progress, known=known, **options)

@@ -203,9 +203,9 @@ def calibrate(
     else:
         moved = ", ".join(f"{n} by {c:.2g} {u}" for n, c, u in problem.stated(change))
         raise ValueError(
-            f"calibration finds no rest: the last of {_STEPS} steps still changed {moved}. Free "
-            "fewer numbers, or give a geometry that is nearer (torchpcct reconstruct says what "
-            "contradicts it)"
+            f"calibration did not converge: the last of {_STEPS} steps still changed {moved}. Free "
+            "fewer parameters, or start from a more accurate geometry (the warnings of torchpcct "
+            "reconstruct say what contradicts the one given)"
         )
     now = problem.at(values, now.effects, errors=True)
     tell(1.0)
@@ -239,7 +239,7 @@ def _names(scan: Scan, free: Sequence[str] | None) -> list[str]:
         return ["offset", "roll"] if rows else ["offset"]
     names = [free] if isinstance(free, str) else list(free)
     if not names:
-        raise ValueError(f"free must name what to find: some of {', '.join(FREE)}")
+        raise ValueError(f"free is empty: name what to estimate, of {', '.join(FREE)}")
     for name in names:
         if name in ("sod", "pitch"):
             raise ValueError(
@@ -282,12 +282,13 @@ class _CalibrationProblem:
         geometry = scan.geometry
         if scan.window is not None:
             raise ValueError(
-                "calibration needs the whole detector; this scan keeps a part of it (a window)"
+                "calibration needs the whole detector, and this scan keeps a window of it: acquire "
+                "it without region="
             )
         if getattr(geometry, "detector", "flat") == "curved":
             raise ValueError(
-                "calibration is of flat detectors; the curved one of a CT scanner is aligned by "
-                "its maker"
+                "calibration works for flat detectors only, this one is curved: measure its "
+                "position with a phantom"
             )
         with_parameters(geometry, **{n: torch.zeros((), dtype=torch.float64) for n in names})
         scan, _ = repair_defects(scan)
@@ -298,7 +299,7 @@ class _CalibrationProblem:
             grid = grid.slice
         if lines.dim() != axes:
             raise ValueError(
-                "calibration needs readings without energy bins: weigh them before, "
+                "calibration needs one channel: sum the energy bins with weights before, "
                 "scan.weighted(bin_weights(scanner, …))"
             )
         self.base, self.grid, self.names = geometry, grid, names
@@ -397,8 +398,8 @@ class _CalibrationProblem:
         for name, share in zip(self.names, state.shares, strict=True):
             if not share >= _LEAST_SHARE:
                 raise ValueError(
-                    f"{name} is not determined by this object: another volume explains all but "
-                    f"{100 * share:.2g} % of what it does to the readings. Leave it out of free, "
+                    f"{name} is not determined by this object: a change of the volume has the same "
+                    f"effect on all but {100 * share:.2g} % of the readings. Leave it out of free, "
                     "or measure it with a phantom of known shape"
                 )
         wide = [
@@ -411,11 +412,11 @@ class _CalibrationProblem:
         bound = [n for k, n in enumerate(self.names) if alike[k].sum() > 1]
         if bound:
             raise ValueError(
-                f"{' and '.join(bound)} cannot be told apart from these readings: they do nearly "
-                f"the same to them. Leave {bound[-1]} out of free"
+                f"{' and '.join(bound)} cannot be distinguished in these readings: their effects "
+                f"are nearly equal. Leave {bound[-1]} out of free"
             )
         raise ValueError(
-            f"{' and '.join(wide)} cannot be told from these readings: the standard error would "
-            "be more than a column, 2° or 3 % of sdd. Leave it out of free, or scan with more "
+            f"{' and '.join(wide)} cannot be determined from these readings: the standard error "
+            "would exceed a column, 2° or 3 % of sdd. Leave it out of free, or scan with more "
             "photons"
         )

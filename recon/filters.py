@@ -398,9 +398,17 @@ def deepinv_denoiser(
     :func:`denoiser_of` takes it.
 
     Args:
-        model: of images whose values are about 0 … 1.
-        unit_hu: HU that are 1 to the model; 0 HU stays 0.
-        slices: a 2-D model: the slices are its batch. Otherwise the volume is one 3-D image.
+        model: denoises images ``(batch, 1, …)`` with values of about 0 … 1.
+        unit_hu: the CT number that is scaled to 1, HU; 0 HU stays 0.
+        slices: True for a 2-D model, whose batch are the slices. Otherwise the volume is one 3-D
+            image.
+
+    Returns:
+        A function of a volume ``(z, y, x)`` in HU and the standard deviation of its noise in HU;
+        it returns HU of the same shape.
+
+    Raises:
+        ValueError: a ``unit_hu`` that is not positive.
     """
     unit = number("unit_hu", unit_hu, positive=True, unit="HU")
 

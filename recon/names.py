@@ -63,7 +63,7 @@ def split_method(spec: Any) -> tuple[str, dict[str, Any]]:
     """
     if isinstance(spec, str) and split_energies(spec)[1] is not None:
         raise ValueError(
-            f"energies= is an option of evaluations, got {spec!r}: weigh the bins of the scan "
+            f"energies= is an option of evaluations, got {spec!r}: sum the bins with weights "
             "before, scan.weighted(torchpcct.spectral.bin_weights(scanner, (a, b), {material: mm}))"
         )
     name, _, rest = spec.partition(":") if isinstance(spec, str) else (spec, "", "")
@@ -107,7 +107,7 @@ def mbir_options(text: str) -> dict[str, str]:
     if "network" in given:
         if "weights" not in given:
             raise ValueError(
-                "network of mbir is the class of weights of yours: give it with weights=FILE"
+                "network of mbir is the class of a network of your own: give weights=FILE, too"
             )
         if not is_module_name(given["network"]):
             raise ValueError(
@@ -163,7 +163,7 @@ def loaded(spec: str) -> Callable[..., object]:
             f"cannot load {spec!r}: {reason} (is its folder on PYTHONPATH?){meant_method(module)}"
         ) from error
     if not callable(found):
-        raise TypeError(f"{spec} is no function")
+        raise TypeError(f"{spec} is not a function: it is a {type(found).__name__}")
     function: Callable[..., object] = found
     return function
 

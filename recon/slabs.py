@@ -144,8 +144,7 @@ class ScanSlices:
         takes = {"slices"} if isinstance(scan, Scan) else own_options(scan)
         if "slices" not in takes:
             raise ValueError(
-                f"{scan} is no file that is read slice by slice: open_scan(…).save(…) makes an "
-                ".h5 of it"
+                f"{scan} cannot be read slice by slice: convert it to .h5 by open_scan(…).save(…)"
             )
         self.source, self.options = scan, options
         self.cells: DefectiveCells | None = None
@@ -466,8 +465,8 @@ def _check(geometry: Geometry, grid: VolumeGrid, method: str) -> None:
     choice("method", method, ("fbp", "pwls"))
     if not geometry.on_circle:
         raise ValueError(
-            "slabs are of parallel, fan or cone beams on a circle: reconstruct a geometry view by "
-            "view whole"
+            "slabs need a parallel, fan or cone beam on a circle: leave out memory= for a geometry "
+            "given view by view"
         )
     if grid.ndim != 3:
         raise ValueError(f"grid must be a (z, y, x) VolumeGrid, got {grid!r}")

@@ -44,11 +44,11 @@ def same_device(**tensors: Tensor | None) -> torch.device:
             first = name, value.device
         elif value.device != first[1]:
             raise ValueError(
-                f"{first[0]} lies on {first[1]} and {name} on {value.device}: move one of them "
+                f"{first[0]} is on {first[1]}, {name} on {value.device}: move one of them "
                 "with .to(…)"
             )
     if first is None:
-        raise ValueError("no tensor is given")
+        raise ValueError("no tensor is given: give at least one")
     return first[1]
 
 

@@ -372,7 +372,9 @@ def _check_seal(path: str | os.PathLike[str], kind: str) -> None:
         if head.startswith(_HDF5_SIGNATURE):
             return  # of an earlier version without checksum, or foreign
         if not head.startswith(_MAGIC):
-            raise ValueError(f"{path} is no torchpcct {kind}, or its beginning is damaged")
+            raise ValueError(
+                f"{path} is not a torchpcct {kind}, or its beginning is damaged: take another copy"
+            )
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     if head != (_MAGIC + digest.encode() + b"\n").ljust(_BLOCK, b"\0"):
         raise ValueError(

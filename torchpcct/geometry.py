@@ -50,8 +50,18 @@ taken as rad. Helical scans of as many turns have far smaller steps."""
 
 @checked
 def full_turn(views: int, start: float = 0.0) -> Floats:
-    """``views`` equally spaced source angles over 2π, ``(views,)`` rad float64, the first at
-    ``start``."""
+    """Equally spaced source angles over a full turn.
+
+    Args:
+        views: number of angles, at least 1.
+        start: the first angle, rad.
+
+    Returns:
+        ``(views,)`` rad float64.
+
+    Raises:
+        ValueError, TypeError: a number of views below 1 or not whole.
+    """
     return np.arange(whole("views", views), dtype=np.float64) * (2.0 * math.pi / views) + start
 
 

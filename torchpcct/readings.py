@@ -489,7 +489,16 @@ def inverse_variance(mean: Tensor, quantum: Tensor, electronic_noise: float) -> 
     """Inverse variance of the logarithm of readings, by the delta method: mean² / (quantum · mean +
     electronic noise²).
 
-    What a starved reading says is bounded by half a quantum, as its logarithm is.
+    For readings of few photons the variance of the reading is at least that of half a quantum, as
+    their logarithm is bounded in the same way.
+
+    Args:
+        mean: expected readings, of any shape; negative ones count as 0.
+        quantum: reading of one photon, a shape that broadcasts to that of ``mean``.
+        electronic_noise: standard deviation of the electronic noise, in units of the readings.
+
+    Returns:
+        Tensor of the shape and dtype of ``mean``.
     """
     mean = mean.clamp(min=0.0)
     return mean.square().div_(
@@ -674,7 +683,9 @@ def interpolate_dead(lines: Tensor, dead: Tensor, rows: bool, most: float = MOST
             "views out with geometry.select"
         )
     if bool(dead.all()):
-        raise ValueError("no live reading is left: the scan cannot be used")
+        raise ValueError(
+            "all readings are dead (NaN, Inf or masked): check the mask dead= and the file"
+        )
     across = (
         ((-1, True), (-2, True), (-1, False), (-2, False)) if rows else ((-1, True), (-1, False))
     )

@@ -329,13 +329,13 @@ class Scan:
         fraction = number("fraction", fraction, positive=True, high=1.0)
         if self.noise_free:
             raise ValueError(
-                "at_dose thins noisy readings, and this scan is noise free: use "
+                "at_dose thins noisy readings, and this scan is noise-free: use "
                 "with_noise(exposure_s, seed)"
             )
         if self.logged and self.info.get("photons") != "given":
             raise ValueError(
-                "these are line integrals of an unknown number of photons: give photons= where "
-                "the scan is made, or the raw counts"
+                "these are line integrals of an unknown number of photons: give photons= to "
+                "Scan.from_line_integrals or open_scan, or use the raw counts"
             )
         self._require_noise_model()
         readings = noise.thinned(
@@ -434,7 +434,8 @@ class Scan:
     def seen_grid(
         self, voxel: float | None = None, extent: object = None, center: object = None
     ) -> VolumeGrid:
-        """What :meth:`torchpcct.VolumeGrid.of` gives."""
+        """The grid that :meth:`torchpcct.VolumeGrid.of` returns for this scan, with the same
+        arguments: voxel size, edge lengths and centre in mm, None for the scan's own."""
         return grid_of(self, voxel, extent, center)
 
     def select(self, views: Views) -> Scan:
@@ -688,7 +689,10 @@ def _check(scan: Scan) -> None:
     if tuple(scan.air.shape) != expected_air:
         raise ValueError(f"air has shape {tuple(scan.air.shape)}, expected {expected_air}")
     if (w is None) != (scan.exterior is None):
-        raise ValueError("a windowed scan needs the readings of its exterior, a full scan has none")
+        raise ValueError(
+            "a windowed scan needs exterior=, the readings of what lies outside its region; a scan "
+            "of the whole detector must have none"
+        )
     if scan.region is not None and (w is None or scan.region.ndim != 3):
         raise ValueError(
             "region must be the (z, y, x) grid that a windowed scan was kept for; a full scan has "

@@ -175,7 +175,8 @@ def _seen_by(g: ConeBeam, window: DetectorWindow, voxel: float) -> VolumeGrid:
         if (box := _box(g, window, voxel, margin)) is not None:
             return box
     raise ValueError(
-        "no box is seen by all views of this scan's part of the detector: give extent and center"
+        "no box lies in the field of view of this scan's part of the detector in all views: give "
+        "extent and center"
     )
 
 

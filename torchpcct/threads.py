@@ -40,7 +40,14 @@ def get_num_threads() -> int:
 
 
 def set_num_threads(number: int) -> None:
-    """Let every call of this process run on so many threads from now on; ``ValueError`` below 1."""
+    """Set the number of threads of all later calls in this process.
+
+    Args:
+        number: at least 1.
+
+    Raises:
+        ValueError: a number below 1.
+    """
     global _number
     if number < 1:
         raise ValueError(f"the number of threads must be at least 1, got {number}")

@@ -55,6 +55,11 @@ def panels(
 ) -> Figure:
     """A matplotlib figure of panels with one grey scale (C150 / W600 HU) and a scale bar.
 
+    Args:
+        grid: rows of panels; a row may be shorter than the others.
+        row_labels: one text for each row, at its left.
+        title, footer: texts above and below all panels.
+
     Returns:
         ``matplotlib.figure.Figure``; save it with ``figure.savefig(path)``.
     """
@@ -152,7 +157,7 @@ def viewer_page(volumes: Sequence[tuple[str, Volume, float, float]], title: str)
         values = flat.data.detach().cpu().numpy().astype(np.float64)
         finite = np.isfinite(values)
         if not finite.any():
-            raise ValueError(f"{label} holds no finite value")
+            raise ValueError(f"{label} has no finite value: reconstruct it again")
         low, high = float(values[finite].min()), float(values[finite].max())
         span = max(high - low, 1e-3 * max(abs(low), abs(high)), 1e-30)
         step = 10.0 ** math.ceil(math.log10(span / (_CODES - 2)))

@@ -32,14 +32,29 @@ __all__ = ["Volume", "from_hu", "to_hu"]
 
 @checked
 def to_hu(attenuation: Tensor, mu_water: float) -> Tensor:
-    """CT numbers from attenuation in mm⁻¹: 1000 (μ / μ_water − 1), so that water reads 0 and air
-    −1000."""
+    """CT numbers from attenuation: 1000 (μ / μ_water − 1), so that water reads 0 and air −1000.
+
+    Args:
+        attenuation: linear attenuation coefficients in mm⁻¹, of any shape.
+        mu_water: that of water, mm⁻¹.
+
+    Returns:
+        HU, of the same shape and dtype.
+    """
     return 1000.0 * (attenuation / mu_water - 1.0)
 
 
 @checked
 def from_hu(numbers: Tensor, mu_water: float) -> Tensor:
-    """Attenuation in mm⁻¹ from CT numbers, the inverse of :func:`to_hu`."""
+    """Attenuation from CT numbers, the inverse of :func:`to_hu`.
+
+    Args:
+        numbers: HU, of any shape.
+        mu_water: linear attenuation coefficient of water, mm⁻¹.
+
+    Returns:
+        Linear attenuation coefficients in mm⁻¹, of the same shape and dtype.
+    """
     return mu_water * (1.0 + numbers / 1000.0)
 
 

@@ -68,14 +68,17 @@ def check_gaps(angles: Floats, period: float = 2.0 * math.pi) -> None:
         )
     if inner > OPEN_GAP_STEPS * usual:
         lacking = (
-            f"views lack inside of the scan: besides its end a gap of {math.degrees(inner):.2f}° "
+            f"views are missing within the scan: a gap of {math.degrees(inner):.2f}° "
             f"where the usual step is {math.degrees(usual):.2f}°"
         )
         if inner > INNER_GAP_RAD:
             raise ValueError(
                 f"{lacking}; reconstruct by 'pwls' or 'mbir', or interpolate the views"
             )
-        _LOG.warning("%s: the views beside it stand for those that lack", lacking)
+        _LOG.warning(
+            "%s: the views on either side of it are weighted in place of those that are missing",
+            lacking,
+        )
 
 
 @checked
@@ -128,8 +131,8 @@ def offset_share(position: Floats) -> Floats:
     low, high = -(position[0] - half_cell), position[-1] + half_cell
     if min(low, high) <= 0:
         raise ValueError(
-            "the detector does not reach the projection of the rotation axis: no turn measures "
-            "all lines"
+            f"all {position.size} columns of the detector lie on one side of the projection of the "
+            "rotation axis, so that no turn measures all lines: check offset, or move the detector"
         )
     side = 1.0 if high >= low else -1.0
     phase = np.clip(side * position / min(low, high), -1.0, 1.0)

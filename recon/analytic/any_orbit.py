@@ -138,13 +138,14 @@ def _divergent(poses: Floats, rows: int, columns: int, cone: bool) -> IdealCircl
     depth = ((source - centre) * radial).sum(1)
     if depth.min() <= 0:
         raise ValueError(
-            f"the detector of view {int(depth.argmin())} does not stand behind the axis"
+            f"the detector of view {int(depth.argmin())} does not lie behind its source: are the "
+            "vectors in the order source, centre, u, v?"
         )
     sdd = float(depth.mean())
     if sdd <= sod:
         raise ValueError(
-            f"the detectors stand {sdd:g} mm from the sources, which turn at {sod:g} mm: before "
-            "the axis"
+            f"the detectors are {sdd:g} mm from the sources, whose orbit has a radius of {sod:g} "
+            "mm: they must lie behind the axis; check the vectors"
         )
     # Where the actual corners meet the ideal plane, seen from the actual source.
     half = np.array([(a * (columns - 1) / 2, b * (rows - 1) / 2) for a in (-1, 1) for b in (-1, 1)])
@@ -157,8 +158,8 @@ def _divergent(poses: Floats, rows: int, columns: int, cone: bool) -> IdealCircl
     towards = -(corner * radial[:, None]).sum(-1)
     if towards.min() <= 0:
         raise ValueError(
-            "a detector reaches behind its source: are the vectors in the order source, centre, "
-            "u, v?"
+            "part of a detector lies behind its source: are the vectors in the order source, "
+            "centre, u, v?"
         )
     scale = sdd / towards
     u, w = (corner * tangent[:, None]).sum(-1) * scale, corner[..., 2] * scale
@@ -193,7 +194,10 @@ def _divergent(poses: Floats, rows: int, columns: int, cone: bool) -> IdealCircl
     maps = np.linalg.solve(actual, wanted)
     ends = np.array([(x, y, 1.0) for x in geometry.column_positions[[0, -1]] for y in v[[0, -1]]])
     if (maps[:, 2] @ ends.T).min() <= 0:
-        raise ValueError("a detector stands almost edge on to its rays")
+        raise ValueError(
+            "a detector is almost parallel to its rays (edge on): are the vectors in the order "
+            "source, centre, u, v?"
+        )
     ideal = sod * radial + np.array([0.0, 0.0, level])
     shift = (ideal - source)[:, ::-1]
     shift[:, 0] -= level  # an orbit about another height is a grid that is lower by as much

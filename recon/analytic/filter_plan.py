@@ -192,7 +192,7 @@ class FilterPlan:
         width_out)``, by numba's kernels on the CPU and by torch on any other device."""
         if data.device.type != "cpu":
             return self._forward_there(data)
-        from recon.analytic.filter_kernels import align  # numba loads with its first use
+        from recon.analytic.align_kernels import align  # numba loads with its first use
 
         a, b = self.window_in, self.window_out
         lead = data.shape[:-3]
@@ -233,7 +233,7 @@ class FilterPlan:
         rows_in, width_in)``."""
         if gradient.device.type != "cpu":
             return self._transpose_there(gradient)
-        from recon.analytic.filter_kernels import unalign  # numba loads with its first use
+        from recon.analytic.align_kernels import unalign  # numba loads with its first use
 
         a, b = self.window_in, self.window_out
         lead = gradient.shape[:-4]

@@ -108,7 +108,7 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     for name in ("region", "reference", "voxel", "extent", "center"):
         if getattr(arguments, name, None) is not None:
             raise ValueError(
-                f"--{name} is of measured scans and volumes: give it with --scans or --volumes"
+                f"--{name} applies to measured scans and volumes: give it with --scans or --volumes"
             )
     n = arguments.realisations if arguments.n is None else arguments.n
     methods = [*(arguments.method or []), *map(_denoiser, arguments.denoiser or [])]
@@ -201,7 +201,7 @@ def _measured(arguments: argparse.Namespace, out: Path) -> None:
     for flag, value in of_tasks.items():
         if value:
             raise ValueError(
-                f"{flag} is of simulated tasks: leave it out with --scans and --volumes"
+                f"{flag} applies to simulated tasks: leave it out with --scans and --volumes"
             )
     if arguments.scans and arguments.volumes:
         raise ValueError("give --scans or --volumes, not both")
@@ -222,7 +222,8 @@ def _scans(arguments: argparse.Namespace) -> tuple[list[Comparison], str, str]:
 
     if arguments.reference is not None:
         raise ValueError(
-            "--reference names one of the --volumes; of --scans it is FBP with the kernel ram-lak"
+            "--reference names one of the --volumes; with --scans the reference is FBP with the "
+            "kernel ram-lak: leave it out"
         )
     methods = [*(arguments.method or []), *map(_denoiser, arguments.denoiser or [])] or list(
         arguments.methods
@@ -255,30 +256,34 @@ def _volumes(arguments: argparse.Namespace) -> tuple[list[Comparison], str, str]
     for flag, value in (("--method", arguments.method), ("--denoiser", arguments.denoiser)):
         if value:
             raise ValueError(
-                f"{flag} is of --scans: --volumes takes what lies in the two folders, a file a "
-                "method"
+                f"{flag} applies to --scans: --volumes compares the files in the two folders, one "
+                "for each method; leave it out"
             )
     if arguments.n is not None:
         raise ValueError(
-            "--n is of --scans: two folders of volumes hold one pair of noise realisations"
+            "--n applies to --scans: two folders of volumes contain one pair of noise "
+            "realisations; leave it out"
         )
     for name in ("voxel", "extent", "center"):
         if getattr(arguments, name) is not None:
-            raise ValueError(f"--{name} is of --scans: volumes say themselves where they lie")
+            raise ValueError(
+                f"--{name} applies to --scans: volumes have a grid already; leave it out"
+            )
     first, second = arguments.volumes
     reference = arguments.reference or "fbp"
     for folder in (first, second):
         if not folder.is_dir():
             raise ValueError(
-                f"{folder} is no folder: --volumes takes two, with one volume a method in each"
+                f"{folder} is not a folder: --volumes takes two, with one volume of each method in "
+                "both"
             )
     stems = [volume_files(folder) for folder in (first, second)]
     names = [name for name in stems[0] if name in stems[1]]
     if reference not in names:
         raise ValueError(
-            f"{first} and {second} hold {', '.join(names) or 'no volumes of one name'}: "
-            "--reference names the one of a linear method that has smoothed nothing (FBP, kernel "
-            "ram-lak)"
+            f"{first} and {second} both have {', '.join(names) or 'no volumes of the same name'}, "
+            f"but not {reference}: --reference names the volume of a linear method without "
+            "smoothing (FBP, kernel ram-lak)"
         )
     pairs = {name: [Volume.load(s[name]) for s in stems] for name in names}
     grid, unit = pairs[reference][0].grid, pairs[reference][0].unit
@@ -329,24 +334,30 @@ def _region(text: str | None, grid: VolumeGrid) -> Bools | None:
             parts = []
         if len(parts) != len(grid.shape):
             raise ValueError(
-                f"--region {text}: neither a file nor ranges of voxels, Z0:Z1,Y0:Y1,X0:X1, of "
-                f"{grid.shape} voxels"
+                f"--region {text}: neither an existing file nor ranges of voxels, "
+                f"Z0:Z1,Y0:Y1,X0:X1, within the {grid.shape} voxels"
             )
         mask[tuple(parts)] = True
     else:
         volume = Volume.load(text)
         if not same_grid(volume.grid, grid):
-            raise ValueError(f"--region {text} lies on {volume.grid}, the volumes on {grid}")
+            raise ValueError(
+                f"--region {text} has the grid {volume.grid}, the volumes {grid}: resample it"
+            )
         mask = np.asarray(volume.data) != 0
     if mask.sum() < 2:
-        raise ValueError(f"--region {text} holds {int(mask.sum())} voxels: two or more are needed")
+        raise ValueError(
+            f"--region {text} selects {int(mask.sum())} voxels, at least two are needed"
+        )
     return mask
 
 
 def _denoiser(text: str) -> str:
     """``package.module:function@BASE``."""
     if "@" not in text:
-        raise ValueError(f"a denoiser needs a base: {text}@fbp:detail")
+        raise ValueError(
+            f"--denoiser {text} does not name the method that it is applied to: {text}@fbp:detail"
+        )
     return text
 
 

@@ -443,7 +443,7 @@ def executing(arguments: argparse.Namespace, out: Path) -> Iterator[Executor | N
     """
     if arguments.threads is not None and arguments.workers is None and not arguments.scheduler:
         raise ValueError(
-            "--threads K is of the workers: give --workers N or --scheduler ADDRESS with it"
+            "--threads K applies to workers: give --workers N or --scheduler ADDRESS with it"
         )
     from recon.jobs import execute
 

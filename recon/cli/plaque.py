@@ -38,8 +38,8 @@ def _plaque(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     scan = Scan.load(arguments.scan)
     if scan.window is None and (arguments.center is None or arguments.extent is None):
         raise ValueError(
-            f"{arguments.scan} holds the whole detector, and a vessel is read in a small inset: "
-            "--center Z Y X and --extent Z Y X say which"
+            f"{arguments.scan} has the whole detector, and the vessel model needs a small inset: "
+            "give its --center Z Y X and --extent Z Y X in mm"
         )
     grid = VolumeGrid.of(
         scan, voxel=arguments.voxel, extent=arguments.extent, center=arguments.center

@@ -73,7 +73,7 @@ def _size(text: str) -> str:
     try:
         memory_bytes(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no size such as 4GB or 500MiB") from None
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size such as 4GB or 500MiB") from None
     return text
 
 
@@ -108,13 +108,13 @@ def _method_options(arguments: argparse.Namespace) -> dict[str, Any]:
             )
         if name in named:
             raise ValueError(
-                f"--{name} stands in --method {arguments.method}, too: leave out one of them"
+                f"--{name} is given in --method {arguments.method}, too: leave out one of them"
             )
     given = named | given
     if "network" in given:
         if "weights" not in given:
             raise ValueError(
-                "--network is the class of weights of yours: give it with --weights FILE"
+                "--network is the class of a network of your own: give its --weights FILE, too"
             )
         if not is_module_name(given["network"]):
             raise ValueError(f"--network must be package.module:Class, got {given['network']!r}")

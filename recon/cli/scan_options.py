@@ -34,7 +34,7 @@ def _slices(text: str) -> slice:
     first, stop = (int(end) if end else None for end in found.groups())
     if first is not None and stop is not None and first >= stop:
         raise argparse.ArgumentTypeError(
-            f"{text!r} holds no slice: the second number must be the larger one"
+            f"{text!r} selects no slice: the second number must be larger than the first"
         )
     return slice(first, stop)
 
@@ -122,7 +122,7 @@ def _number_or_file(text: str) -> float | str:
         return _there(text)
     if not math.isfinite(value) or value < 0:
         raise argparse.ArgumentTypeError(
-            f"{text!r} is no reading: a finite number of 0 or more, or a file"
+            f"{text!r} is not a reading: give a finite number of at least 0, or a file"
         )
     return value
 
@@ -133,7 +133,7 @@ def _there(text: str) -> str:
     if not text.strip():
         raise argparse.ArgumentTypeError("it is empty")
     if not path.exists() and not any(c in text for c in "*?["):
-        raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor a file that is there")
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor an existing file")
     return str(path)
 
 
@@ -191,7 +191,7 @@ def length(text: str) -> float:
         return float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(
-            f"{text!r} is no length in mm (a file stands before this option)"
+            f"{text!r} is not a length in mm (files must be given before this option)"
         ) from None
 
 

@@ -72,7 +72,7 @@ def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     check_output(arguments, _is_scan, arguments.config, beside=True)
     if arguments.config is not None and (arguments.views is not None or arguments.whole):
         raise ValueError(
-            "--views and --whole are the plaque scan's: put views and region into the configuration"
+            "--views and --whole apply to the plaque scan: with --config set views and region there"
         )
     from torchpcct.acquisition.acquire import acquire, plan, readings_key
     from torchpcct.acquisition.config import read_config

@@ -169,8 +169,8 @@ def _view(arguments: argparse.Namespace, progress: ProgressBars) -> None:
             raise FileNotFoundError(f"no such file: {file}")
         if not _is_volume(file):
             raise ValueError(
-                f"{file} is a scan, no volume: torchpcct reconstruct it first, info says what it "
-                "holds"
+                f"{file} is a scan, not a volume: torchpcct reconstruct makes one, torchpcct info "
+                "describes the scan"
             )
     from torchpcct.volume import Volume
 
@@ -179,7 +179,7 @@ def _view(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     volumes = [Volume.load(file, fill=math.nan) for file in files]
     for file, volume in zip(files, volumes, strict=True):
         if not bool(volume.data.isfinite().any()):
-            raise ValueError(f"{file} holds no finite value")
+            raise ValueError(f"{file} has no finite value: reconstruct it again")
     scales = [
         _SCALE_OF_CHANGES
         if file in changes

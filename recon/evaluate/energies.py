@@ -110,7 +110,7 @@ class EnergyRealisations(Realisations):
         kernels: of FBP that methods with this option ask for.
 
     Raises:
-        ValueError: a task whose tissues are painted in HU, a scanner without energy bins, materials
+        ValueError: a task whose tissues are given in HU, a scanner without energy bins, materials
             that do not exist or do not differ.
     """
 
@@ -119,7 +119,7 @@ class EnergyRealisations(Realisations):
         super().__init__(task, base.store, base.seed, kernels or base.kernels[:1])
         if not task.has_energies:
             raise ValueError(
-                f"task {task.name} has no energies: its tissues are painted in HU; energies= takes "
+                f"task {task.name} has no energies: its tissues are given in HU; energies= takes "
                 "tasks whose scene is made of bodies alone"
             )
         self.base, self.scanner = base, with_bins(task.scanner, f"task {task.name}")

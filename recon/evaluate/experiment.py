@@ -130,7 +130,7 @@ def evaluate(
     if weighted and not any(t.has_energies for t in todo):
         painted = ", ".join(t.name for t in todo)
         raise ValueError(
-            f"{', '.join(weighted)}: {painted} paint their tissues in HU and have no energies; "
+            f"{', '.join(weighted)}: the tissues of {painted} are given in HU, without energies; "
             "energies= takes tasks whose scene is made of bodies alone"
         )
     exposures = (
@@ -180,7 +180,7 @@ def evaluate(
 
 
 def _everyone(task: Task, methods: Sequence[Method]) -> list[Method]:
-    """The methods after the task's reference; of tissues painted in HU there are no energies."""
+    """The methods after the task's reference; of tissues given in HU there are no energies."""
     reference = method_of(task.reference)
     if not reference.is_fbp:
         raise ValueError(
@@ -189,7 +189,7 @@ def _everyone(task: Task, methods: Sequence[Method]) -> list[Method]:
     for method in methods:
         if method.energies is not None and not task.has_energies:
             log.warning(
-                "%s is left out of task %s, whose tissues are painted in HU: they have no energies",
+                "%s is left out of task %s: its tissues are given in HU, without energies",
                 method.name,
                 task.name,
             )
@@ -217,8 +217,8 @@ def _sent(
             sent.append(method)
         except Unportable as error:
             log.warning(
-                "%s is computed here, not by other processes: it is made of a function that they "
-                "cannot load (%s); a function of a module can be loaded",
+                "%s is computed in this process: other processes cannot load its function (%s); "
+                "put it into a module",
                 method.name,
                 error,
             )
@@ -543,7 +543,8 @@ def measured_before(
         return []
     if given != before:
         log.warning(
-            "%s was measured at other tasks, exposures or realisations: its methods leave the page",
+            "%s was measured at other tasks, exposures or realisations: its methods are removed "
+            "from the report",
             report,
         )
         return []
@@ -560,7 +561,8 @@ def measured_before(
             kept.append(name)
         else:
             log.warning(
-                "%s leaves the page of %s: it, or what computes it, has changed; give it again",
+                "%s is removed from %s: the method, or the code that computes it, has changed; "
+                "give it again to measure it",
                 name,
                 report,
             )
@@ -605,6 +607,13 @@ def export_scans(
     the volumes in HU under the scans' names (``.nii.gz``, ``.mha``, ``.h5``, ``.zarr`` or DICOM
     folders) in ``OTHER/TASK``, and evaluate the method ``files:OTHER``. ``torchpcct reconstruct
     FOLDER/TASK/*.h5 --out OTHER/TASK`` does so; its ``_METHOD`` may stay.
+
+    Args:
+        tasks: names, files or tasks, one or several.
+        folder: FOLDER above; it is made if it does not exist.
+        exposures_s: in s; None: those of each task.
+        n: noise realisations, at least 8.
+        seed: of the first realisation.
 
     Returns:
         The files of the scans.

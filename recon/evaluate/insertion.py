@@ -262,7 +262,9 @@ def contrast_recovery(
         raise ValueError("methods must name at least one method")
     require_no_energies(asked)
     if scan.counts.ndim > len(scan.geometry.shape) and scan.geometry.has_rows:
-        raise ValueError("the scan has several energy bins: weigh them before (Scan.weighted)")
+        raise ValueError(
+            "the scan has several energy bins: sum them with weights before (Scan.weighted)"
+        )
     whole("n", n, low=1)
     axes = grid.ndim
     scan, grid = as_slices(scan, grid)
@@ -424,8 +426,8 @@ def insertion_places(
     free = np.argwhere(room)
     if not len(free):
         raise ValueError(
-            f"there is no room for a ball of {ball} in the object that the grid shows: a larger "
-            "grid, a smaller ball, or name places="
+            f"a ball of {ball} fits nowhere into the object on this grid: give a larger grid, a "
+            "smaller ball, or places="
         )
     random = np.random.default_rng(seed)
     if len(free) > _CANDIDATES:

@@ -84,15 +84,24 @@ class Realisation(Protocol):
         ...
 
     def pwls(self) -> Tensor:
-        """PWLS with the default prior, HU."""
+        """PWLS with the default prior, HU ``(z, y, x)``, ``grid.shape``."""
         ...
 
     def mbir(self, network: Mbir) -> Tensor:
-        """MBIR, HU."""
+        """MBIR with this network, HU ``(z, y, x)``, ``grid.shape``."""
         ...
 
     def sigma(self, method: Method, smooths: float = 0.0) -> float:
-        """Noise in HU of a linear method, of its volume smoothed with so many voxels."""
+        """Noise of a linear method in homogeneous tissue.
+
+        Args:
+            method: FBP of one of the kernels that were declared.
+            smooths: standard deviation, in voxels, of a Gaussian that smooths the noise before; 0:
+                none.
+
+        Returns:
+            Standard deviation of a voxel, HU.
+        """
         ...
 
 
@@ -292,14 +301,14 @@ def _of_files(spec: str, folder: Path) -> Method:
             )
         if not found:
             raise FileNotFoundError(
-                f"{folder} holds no volume {realisation.label}, by itself or with _fbp, _pwls or "
-                "_mbir behind: reconstruct the exported scan of that name"
+                f"{folder} has no volume {realisation.label}, with or without _fbp, _pwls or _mbir "
+                "appended: reconstruct the exported scan of that name"
             )
         volume = Volume.load(found[0])
         if not same_grid(volume.grid, realisation.grid):
-            raise ValueError(f"{found[0]} lies on {volume.grid}, the task on {realisation.grid}")
+            raise ValueError(f"{found[0]} has the grid {volume.grid}, the task {realisation.grid}")
         if volume.unit != "HU":
-            raise ValueError(f"{found[0]} is in {volume.unit}, not in HU")
+            raise ValueError(f"{found[0]} is in {volume.unit}: HU are needed")
         return volume.data
 
     return Method(spec, run, key=f"{folder.resolve()} {_content(folder)}")

@@ -71,7 +71,9 @@ def check_method(spec: str) -> None:
         mbir_options(rest)
     elif name == "files":
         if not Path(rest).is_dir() or not rest:
-            raise FileNotFoundError(f"no folder {rest!r} with volumes")
+            raise FileNotFoundError(
+                f"no such folder: {rest!r}; files:FOLDER needs one with volumes"
+            )
     elif not name or (not rest and name != "pwls"):
         known = "fbp:KERNEL, pwls, mbir, FILTER@BASE, package.module:function, files:FOLDER"
         raise ValueError(f"unknown method {spec!r}: one of {known}{meant_method(spec)}")
@@ -83,8 +85,7 @@ def _check_energies(method: str, energies: str) -> None:
     """Refuse what is no contrast, and methods that are given no scans."""
     if method.startswith("files:"):
         raise ValueError(
-            f"energies= weighs the scans that a method is given, and {method!r} is given none: "
-            "leave it out"
+            f"energies= weights the bins of a scan, and {method!r} reads volumes: leave it out"
         )
     if energies in ("", "task", *CONTRASTS):
         return

@@ -245,7 +245,7 @@ class Simulated:
         """HU ``(z, y, x)``."""
         if kernel not in self._realisations.kernels:
             raise ValueError(
-                f"FBP with the kernel {kernel!r} was not announced: Method(..., "
+                f"FBP with the kernel {kernel!r} was not declared: Method(..., "
                 f"kernels=({kernel!r},))"
             )
         return self._fbp[self._realisations.kernels.index(kernel)]

@@ -154,8 +154,17 @@ def _row(rows: list[Record], **wanted: object) -> Record:
 
 
 def save(evaluation: Evaluation, folder: str | os.PathLike[str], command: str = "") -> list[Path]:
-    """Write ``report.md``, ``report.json``, ``report.csv``, ``report.html`` and a picture a
-    task; the files written."""
+    """Write ``report.md``, ``report.json``, ``report.csv``, ``report.html`` and a picture for each
+    task.
+
+    Args:
+        evaluation: what :func:`recon.evaluate.evaluate` returns.
+        folder: it is made if it does not exist; reports in it are replaced.
+        command: that repeats the evaluation, for the end of the report; "": none.
+
+    Returns:
+        The files written.
+    """
     text = text_of(evaluation) + (f"\nCommand: `{command}`.\n" if command else "")
     for seen in evaluation.results:
         name = seen.task.name

@@ -378,7 +378,7 @@ class Task:
                 return np.asarray(share > least)
         raise ValueError(
             f"task {self.name}: {int((share > _MOSTLY).sum())} voxels of the inset lie in "
-            f"{name!r}, {_FEW} are needed: take smaller voxels, or an inset that holds it"
+            f"{name!r}, {_FEW} are needed: take smaller voxels, or an inset that contains it"
         )
 
     def _small(self, signal: Bools, around: Bools, here: Bools) -> tuple[Bools, Bools]:

@@ -244,6 +244,7 @@ class VesselTask(Task):
 
     Args:
         direction: a name of :data:`recon.evaluate.vessels.SHAPES`.
+        Others: see :class:`recon.evaluate.task.Task`.
     """
 
     direction: str = "tilted"
@@ -417,6 +418,7 @@ class VoxelTask(_PaintedTask):
             out.
         spacing: ``(z, y, x)`` of their voxels, mm.
         tissues: name → label and HU on this scanner; signal and background are two of them.
+        Others: see :class:`recon.evaluate.task.Task`.
 
     Raises:
         ValueError: labels that are not whole numbers or of three axes, a label that no voxel has, a
@@ -501,6 +503,7 @@ class AnatomyTask(_PaintedTask):
 
     Args:
         anatomy: a name of :data:`recon.evaluate.anatomies.ANATOMIES`.
+        Others: see :class:`recon.evaluate.task.Task`.
 
     Raises:
         ValueError: another signal than ``"feature"``, a background that is neither a tissue of the

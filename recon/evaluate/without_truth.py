@@ -148,7 +148,8 @@ def evaluate_scans(
     if len(given) == 1:
         if n > 1:
             raise ValueError(
-                f"n = {n} pairs are made of two scans by exchanging views: one scan makes one pair"
+                f"n = {n} pairs need two scans, whose views are exchanged; one scan gives one "
+                "pair: leave out n"
             )
         given = halves(given[0])
     if len(given) != 2 or any(not isinstance(s, Scan) for s in given):
@@ -160,7 +161,7 @@ def evaluate_scans(
         )
     if n > 1 and given[0].geometry != given[1].geometry:
         raise ValueError(
-            "views can be exchanged between scans of one geometry only: these have two; leave out n"
+            "views can be exchanged between scans of the same geometry only: leave out n"
         )
     if (
         n > 1
@@ -168,7 +169,7 @@ def evaluate_scans(
         > _SAME_LIGHT
     ):
         raise ValueError(
-            "views can be exchanged between scans of one exposure only: these have two; leave out n"
+            "views can be exchanged between scans of the same exposure only: leave out n"
         )
     given, grid = [as_slices(s, grid)[0] for s in given], as_slices(given[0], grid)[1]
     names = [method_of(m) for m in listed(methods)]
@@ -191,8 +192,8 @@ def require_no_energies(methods: Sequence[Method]) -> None:
     weighted = [m.name for m in methods if m.energies is not None]
     if weighted:
         raise ValueError(
-            f"{', '.join(weighted)}: energies= weighs the bins of simulated scans; weigh those of "
-            "measured ones before, scan.weighted(torchpcct.spectral.bin_weights(…))"
+            f"{', '.join(weighted)}: energies= applies to simulated scans; sum the bins of a given "
+            "scan with weights before, scan.weighted(torchpcct.spectral.bin_weights(…))"
         )
 
 

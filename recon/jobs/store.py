@@ -93,8 +93,8 @@ class Store:
         foreign = is_foreign(path)
         if foreign:
             log.warning(
-                "%s is no piece of a study: it is left as it is, and the piece of that name is "
-                "not kept",
+                "%s is not a stored result of a study: it is left unchanged, and the result of "
+                "that name is not stored",
                 path,
             )
         elif path.exists():
@@ -103,7 +103,7 @@ class Store:
                     arrays = {k: file[k] for k in file.files if k != _MARK}
                 found, digest = (str(arrays.pop(k, "")) for k in ("key", "sum"))
                 if digest != _digest(found, arrays):
-                    raise ValueError("its content does not have its checksum")
+                    raise ValueError("its content does not match its checksum")
                 if found == key:
                     return unpacked(arrays)
                 log.info("%s was made with other settings: computed again", path)
@@ -385,5 +385,7 @@ def _unpacked(tree: Any, arrays: Mapping[str, Array]) -> Any:
     ours = module.startswith(("torchpcct.", "recon."))
     made: type | None = getattr(importlib.import_module(module), name) if ours else None
     if made is None or not is_dataclass(made):
-        raise ValueError(f"a piece holds a {module}.{name}, which is no dataclass of this software")
+        raise ValueError(
+            f"a stored result has a {module}.{name}, which is not a dataclass of this software"
+        )
     return made(**{k: _unpacked(v, arrays) for k, v in parts.items()})

@@ -66,8 +66,8 @@ def require_device(scan: Scan, device: torch.device) -> None:
     """Refuse a scan that lies on another device than the problem it is given to (ValueError)."""
     if scan.device != device:
         raise ValueError(
-            f"the scan lies on {scan.device} and the problem that was made for it on {device}: "
-            f'move the scan, scan.to("{device}"), or make the problem of the one that was moved'
+            f"the scan is on {scan.device}, the problem that was made for it on {device}: "
+            f'move the scan, scan.to("{device}"), or make the problem from the moved scan'
         )
 
 

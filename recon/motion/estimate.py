@@ -102,8 +102,8 @@ def estimate_motion(
     along = float(np.abs(path[:, 0]).max())
     if held and along > _REACH_ALONG_MM:
         raise PathTooLongError(
-            f"the path that fits leads {along:.2g} mm away from its mean along the axis, more than "
-            f"the {_REACH_ALONG_MM:g} mm up to which such a path can be trusted: give the "
+            f"the estimated path reaches {along:.2g} mm from its mean along the axis, more than "
+            f"the {_REACH_ALONG_MM:g} mm up to which such estimates are reliable: give the "
             "displacement in every view, motion=path, or reconstruct a part of the turn"
         )
     after = found.problem.at(found.coefficients, found.effects)[0].misfit if held else rest
@@ -275,12 +275,12 @@ def _require_inset(scan: Scan) -> None:
         raise TypeError(f"scan must be a Scan, got {type(scan).__name__}")
     if not isinstance(scan.geometry, ConeBeam):
         raise ValueError(
-            "motion is estimated of a cone beam on a circle, this scan has a "
+            "motion is estimated for cone beams on a circle only, this scan has a "
             f"{type(scan.geometry).__name__}: give the displacement in every view, motion=path"
         )
     if scan.window is None or scan.exterior is None:
         raise ValueError(
-            "the motion of an inset and an unknown exterior cannot both be found: acquire the "
+            "motion can be estimated only if the exterior of the inset is known: acquire the "
             "scan with region="
         )
     if scan.counts.ndim != 3:

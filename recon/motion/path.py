@@ -167,7 +167,7 @@ def _read(motion: JsonObject) -> tuple[Floats, Floats | None]:
     """Path and errors ``(views, 3)``."""
     if "path_mm" not in motion:
         raise ValueError(
-            "this report holds no path: give InsetMotion.report(), or volume.report['motion'] of "
+            "this report has no path: give InsetMotion.report(), or volume.report['motion'] of "
             'a volume reconstructed with motion="estimate"'
         )
     path = np.asarray(motion["path_mm"], dtype=np.float64)

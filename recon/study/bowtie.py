@@ -25,7 +25,7 @@ from recon.analytic.fbp import fbp
 from recon.evaluate.experiment import evaluate
 from recon.evaluate.tasks import read_task
 from recon.jobs.store import Pieces, Step
-from recon.study.paper import facts as paper
+from recon.study.paper import published as paper
 from recon.study.report import Check, around
 from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.acquisition.acquire import acquire

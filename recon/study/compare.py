@@ -22,7 +22,7 @@ from recon.evaluate.tasks import read_task
 from recon.jobs.store import Pieces
 from recon.study.energies import VIEWS, energy_rows
 from recon.study.figures import extent
-from recon.study.paper import facts as paper
+from recon.study.paper import published as paper
 from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.roi import axial_grid, sample_axial

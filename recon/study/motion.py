@@ -31,8 +31,8 @@ from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.mbir.mbir import Mbir
 from recon.motion import estimate_motion
 from recon.study.figures import curve_axes, middle_panel, plaque_panel
-from recon.study.motion_found import CASES, found_paths
-from recon.study.paper import facts as paper
+from recon.study.motion_estimates import CASES, found_paths
+from recon.study.paper import published as paper
 from recon.study.paper.plaque_scan import (
     SCANNERS,
     PlaqueImage,
@@ -104,7 +104,7 @@ class MotionSettings(StudySettings):
         methods: of the compensation, of ``"fbp"`` (always), ``"pwls"``, ``"mbir"``.
         found_mm: amplitudes of the motions that are estimated from the scan itself, mm.
         found_exposures_s: exposures of these estimates.
-        found_cases: of :data:`recon.study.motion_found.CASES`.
+        found_cases: of :data:`recon.study.motion_estimates.CASES`.
         found_draws: noise realisations of each.
     """
 

@@ -30,7 +30,7 @@ from torch import Tensor
 from recon.analytic.exact_noise import roi_adjoints
 from recon.jobs.store import Pieces
 from recon.study.figures import extent, roi_outlines
-from recon.study.paper import facts as paper
+from recon.study.paper import published as paper
 from recon.study.paper.plaque_scan import (
     REFERENCE_KERNEL,
     REFERENCE_VOXEL_MM,

@@ -25,8 +25,8 @@ from recon.api import reconstruct
 from recon.jobs.store import Pieces, Step
 from recon.motion import InsetMotion
 from recon.study.figures import curve_axes
-from recon.study.motion_found import AlongAxis, JumpMotion, motion_or_refusal
-from recon.study.paper import facts as paper
+from recon.study.motion_estimates import AlongAxis, JumpMotion, motion_or_refusal
+from recon.study.paper import published as paper
 from recon.study.paper.plaque_scan import duty
 from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.acquisition.acquire import acquire

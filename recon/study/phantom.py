@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from recon.study.paper import facts as paper
+from recon.study.paper import published as paper
 from recon.study.report import Check, around
 from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.geometry import VolumeGrid

@@ -19,7 +19,7 @@ from recon.jobs.store import Pieces
 from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.mbir import Mbir
 from recon.mbir.unrolled import DEFAULT_FIDELITY
-from recon.study.paper import facts as paper
+from recon.study.paper import published as paper
 from recon.study.paper.plaque_scan import duty
 from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.acquisition.acquire import acquire

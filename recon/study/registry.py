@@ -165,7 +165,7 @@ def measured(
         if hasattr(study, "plan"):
             study.plan(settings, pieces)
         raise execute.Planned(
-            f"nothing was run: what is left of the study {name} is no jobs, one process computes it"
+            f"nothing was run: the rest of the study {name} has no jobs, one process computes it"
         )
     found: Measured = study.measure(settings, timed, pieces)
     found.seconds = timed.seconds

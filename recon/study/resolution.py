@@ -29,7 +29,7 @@ from torch import Tensor
 from recon.analytic.exact_noise import roi_covariance
 from recon.jobs.store import Pieces
 from recon.study.figures import curve_axes, middle_panel, plaque_panel
-from recon.study.paper import facts as paper
+from recon.study.paper import published as paper
 from recon.study.paper.plaque_scan import (
     REFERENCE_KERNEL,
     REFERENCE_VOXEL_MM,

@@ -103,7 +103,7 @@ test_refusals = refusals(
     ("unknown size", lambda: calibrate(_fan(), GRID, ["sod"])),
     ("sdd is not determined", lambda: calibrate(_fan(), GRID, ["offset", "sdd"])),
     (
-        "offset and axis cannot be told apart",
+        "offset and axis cannot be distinguished",
         lambda: calibrate(
             _scan(line_integrals(PARALLEL, DISCS), PARALLEL), GRID, ["offset", "axis"]
         ),
@@ -114,7 +114,7 @@ test_refusals = refusals(
     ),
     ("did you mean 'offset'", lambda: calibrate(_fan(), GRID, ["ofset"])),
     ("twice", lambda: calibrate(_fan(), GRID, ["offset", "offset"])),
-    ("name what to find", lambda: calibrate(_fan(), GRID, [])),
+    ("name what to estimate", lambda: calibrate(_fan(), GRID, [])),
     ("needs a detector with rows", lambda: calibrate(_fan(), GRID, ["roll"])),
     ("flat", lambda: calibrate(_scan(line_integrals(CURVED, DISCS), CURVED), GRID)),
     ("must be a Scan", lambda: calibrate(torch.zeros(3), GRID)),  # type: ignore[arg-type]

@@ -68,7 +68,7 @@ def test_the_example_configuration_is_complete(tmp_path, cli):
 @pytest.mark.parametrize(
     ("text", "expected_text"),
     [
-        ("scene: [", "is no YAML"),
+        ("scene: [", "is not YAML"),
         (
             "scene: {kind: water, diameter: 100}\nexposure: 1",
             "unknown exposure; it takes scene, scanner, exposure_s",
@@ -218,8 +218,8 @@ def test_a_foreign_scan_without_pixel_size(here, cli):
     assert '"spacing_pixels": [1.0, 1.0, 1.0],' in report  # lists on one line
     assert "mean_hu" not in report
     for option, message in (
-        ("--mu-water 0.02", "it does not know the size of its pixels: give --pitch MM, too"),
-        ("--photons 100", "--photons N belongs to line integrals"),
+        ("--mu-water 0.02", "the size of its pixels is unknown: give --pitch MM, too"),
+        ("--photons 100", "--photons N applies to line integrals"),
         ("--slices 7:", "--slices A:B must lie within the 1 rows"),
         ("--pitch -1", "--pitch must be greater than 0 mm"),
     ):
@@ -234,7 +234,7 @@ def test_names_and_grey_scale_of_their_own(here, cli):
     plan = json.loads(cli("reconstruct lines.h5 --dry-run --json"))
     assert plan["estimate"]["file"] == "lines_fbp.nii.gz"
     assert plan["geometry"]["kind"] == "parallel"
-    assert "is a scan, no volume" in cli("view lines.h5", 2)
+    assert "is a scan, not a volume" in cli("view lines.h5", 2)
     ramp = torch.linspace(0.0, 0.2, 48).reshape(3, 4, 4)
     Volume(ramp, VolumeGrid((3, 4, 4), 1.0), unit="mm^-1").save("small.nii.gz")
     assert "level 0.1, window 0.19" in cli("view small.nii.gz")
@@ -250,7 +250,7 @@ def test_names_and_grey_scale_of_their_own(here, cli):
     assert about["highest"] == pytest.approx(0.2)
     assert "level 0.1" in cli("view holes.nii")
     Volume(ramp * torch.nan, VolumeGrid((3, 4, 4), 1.0), unit="mm^-1").save("none.nii")
-    assert "none.nii holds no finite value" in cli("view none.nii", 2)
+    assert "none.nii has no finite value" in cli("view none.nii", 2)
 
 
 def test_a_lower_dose_of_a_scan_file(here, cli):
@@ -418,4 +418,4 @@ def test_what_a_drawn_vessel_has_changed_is_written_and_shown(here, cli, clean, 
 def test_a_vessel_is_read_where_the_scan_was_taken_or_said(here, cli):
     cone = ConeBeam(full_turn(8), 60.0, 100.0, 6, 4, 1.0)
     Scan.from_counts(np.ones((8, 4, 6), np.float32), cone, air=2.0).save("whole.h5")
-    assert "--center Z Y X and --extent Z Y X say which" in cli("plaque whole.h5 --out reading", 2)
+    assert "--center Z Y X and --extent Z Y X in mm" in cli("plaque whole.h5 --out reading", 2)

@@ -211,7 +211,7 @@ def test_a_scan_alone_is_given_to_the_workers_that_were_asked_for(here, lines, c
     for words, message in (
         ("--workers 0", "--workers must be at least 1, got 0"),
         ("--threads 0 --workers 1", "--threads must be at least 1"),
-        ("--threads 2", "--threads K is of the workers"),
+        ("--threads 2", "--threads K applies to workers"),
         ("--scheduler nowhere", "'nowhere' is neither an address"),
     ):
         assert message in cli(f"reconstruct one.h5 {words}", 2)

@@ -153,9 +153,9 @@ def test_devices_that_cannot_are_refused_in_one_sentence(monkeypatch):
         replace(scan, counts=scan.counts.half())
     problem = FieldProblem(scan, grid)
     with standin():
-        with pytest.raises(ValueError, match=r"scan lies on meta and the problem .* on cpu"):
+        with pytest.raises(ValueError, match=r"scan is on meta, the problem .* on cpu"):
             reconstruct(scan, grid, "pwls", problem=problem, device=DEVICE)
-        with pytest.raises(ValueError, match="counts lies on meta and air on cpu"):
+        with pytest.raises(ValueError, match="counts is on meta, air on cpu"):
             replace(scan, counts=scan.counts.to(DEVICE))
         monkeypatch.setattr("torchpcct.devices.available_bytes", lambda device: 1000)
         monkeypatch.setattr("recon.least_squares.memory.available_bytes", lambda device: 1000)

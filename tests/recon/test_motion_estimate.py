@@ -19,7 +19,7 @@ from recon.motion import PathTooLongError, estimate_motion
 from recon.motion.belief import believed, likelihood_of
 from recon.motion.estimate import _about, _Found
 from recon.motion.problem import MotionProblem, basis_of
-from recon.study.motion_found import AlongAxis, JumpMotion
+from recon.study.motion_estimates import AlongAxis, JumpMotion
 from recon.study.paths import KINDS, true_path
 from recon.variable_projection import Normal
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, acquire, full_turn
@@ -307,9 +307,9 @@ def test_refusals(moving):
     flat = Scan.from_line_integrals(torch.zeros(fan.shape), fan, photons=1e4, mu_water=0.02)
     few = moving.select(slice(0, None, 2))
     refused(
-        ("exterior cannot both be found", lambda: estimate_motion(whole, GRID)),
+        ("only if the exterior of the inset is known", lambda: estimate_motion(whole, GRID)),
         ("at least 48 views", lambda: estimate_motion(few, GRID)),
-        ("cone beam on a circle", lambda: estimate_motion(flat, GRID)),
+        ("cone beams on a circle", lambda: estimate_motion(flat, GRID)),
         ("needs rotation_s", lambda: estimate_motion(moving, GRID, heart_rate=60.0)),
         ("give both", lambda: estimate_motion(moving, GRID, rotation_s=0.35)),
         ("must be a Scan", lambda: estimate_motion(torch.zeros(3), GRID)),  # type: ignore[arg-type]

@@ -46,5 +46,5 @@ def test_the_picture_shows_path_band_and_jump():
 
 def test_a_report_without_a_path_is_refused():
     for make in (path_table, path_figure):
-        with pytest.raises(ValueError, match="holds no path"):
+        with pytest.raises(ValueError, match="has no path"):
             make({"method": "fbp"})

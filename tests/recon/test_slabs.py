@@ -318,7 +318,7 @@ def test_what_slabs_do_not_do_is_refused_by_name(tmp_path):
             lambda: reconstruct_to(scan, GRID, tmp_path / "v.nii.gz"),
         ),
         ("needs a grid of as many", lambda: reconstruct_to(made(PARALLEL, slices=6), GRID, path)),
-        ("read slice by slice", lambda: reconstruct_to(tmp_path / "s.prep", GRID, path)),
+        ("cannot be read slice by slice", lambda: reconstruct_to(tmp_path / "s.prep", GRID, path)),
         (
             "dead near row",
             lambda: reconstruct_to(replace(scan, dead=dead), GRID, path, memory=4_200_000),
@@ -379,7 +379,7 @@ def test_files_of_others_with_the_names_of_an_unfinished_volume_stay(tmp_path, n
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     path.write_text('{"key": "mine"}')
-    with pytest.raises(FileExistsError, match="is no unfinished volume of torchpcct: move it"):
+    with pytest.raises(FileExistsError, match="is not an unfinished volume of torchpcct: move it"):
         SlabFile(
             tmp_path / name.partition(".unfinished")[0], VolumeGrid((3, 4, 5), 1.0), "HU", "key", 1
         )

@@ -109,7 +109,7 @@ def test_what_no_page_can_show_is_refused(monkeypatch):
     mm = Volume(torch.zeros(1, 2, 2), grid)
     with pytest.raises(ValueError, match="one unit of length, got mm and pixels"):
         viewer_page([("a", pixels, 0.0, 1.0), ("b", mm, 0.0, 1.0)], "t")
-    with pytest.raises(ValueError, match="a holds no finite value"):
+    with pytest.raises(ValueError, match="a has no finite value"):
         viewer_page([("a", Volume(torch.full((1, 2, 2), torch.nan), grid), 0.0, 1.0)], "t")
     monkeypatch.setattr("torchpcct.viz._MOST_VOXELS", 7)
     with pytest.raises(ValueError, match="too many for one page"):

@@ -72,7 +72,7 @@ def test_sections_from_plain_values():
         ("decay: 1.5", "decay must lie in"),
         ("network: {gate: true}", "network: gate needs the filtered view"),
         ("- 3", "mapping"),
-        ("a: [", "no YAML"),
+        ("a: [", "not YAML"),
     ],
 )
 def test_bad_values_name_the_key(text, message, tmp_path):

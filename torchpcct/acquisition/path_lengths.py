@@ -71,7 +71,7 @@ def tissue_path_lengths(
         raise TypeError(f"geometry must be a ConeBeam, got {type(geometry).__name__}")
     if not scene.is_static:
         raise ValueError(
-            "the scene moves: path lengths are those of one place, give scene.with_motion(None)"
+            "the scene moves, and path lengths need one position: give scene.with_motion(None)"
         )
     if window is None:
         window = DetectorWindow.full(geometry)

@@ -128,8 +128,8 @@ def rotation_axis(lines: Tensor, geometry: Geometry) -> RotationAxis:
         )
     if not g.parallel:
         few = (
-            "hardly any line was measured twice, which tells the axis of a fan or cone beam: a "
-            "full turn does"
+            "hardly any line was measured twice (conjugate rays), which the search for the axis of "
+            "a fan or cone beam needs: scan a full turn"
         )
         raise ValueError(few if shares is None else _NOTHING)
     # What all views of a full turn share may tell it, too: an object that is round about the axis

@@ -144,7 +144,7 @@ def check_static(scene: Scene) -> None:
     """Raise ``ValueError`` for a moving scene."""
     if not scene.is_static:
         raise ValueError(
-            "the scene moves: a dose map is that of one place, give scene.with_motion(None)"
+            "the scene moves, and a dose map needs one position: give scene.with_motion(None)"
         )
 
 

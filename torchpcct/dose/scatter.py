@@ -186,14 +186,19 @@ def monte_carlo_dose(
             "bodies reach the edge of the grid: give a larger grid, so that no scatter is lost"
         )
     if (labels < 0).all():
-        raise ValueError(f"no body in the slice z = {z_mm:g} mm on this grid")
+        raise ValueError(
+            f"no body in the slice z = {z_mm:g} mm on this grid: give another z_mm or grid"
+        )
     materials = list(dict.fromkeys(scene.materials))
     index = np.array([materials.index(m) for m in scene.materials] + [-1], dtype=np.int64)
     medium = index[labels]
     radius = float(np.hypot(points[..., 0], points[..., 1])[medium >= 0].max()) + grid.spacing[0]
     sod = scanner.geometry.sod
     if radius >= sod:
-        raise ValueError(f"bodies reach beyond the source orbit of {sod} mm")
+        raise ValueError(
+            f"bodies reach {radius:.4g} mm from the axis, beyond the source orbit of {sod} mm: "
+            "shrink or move them"
+        )
 
     half = fan_half_angle(scanner)
     middle = half * (2.0 * (np.arange(_FAN_NODES) + 0.5) / _FAN_NODES - 1.0)

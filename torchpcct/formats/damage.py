@@ -159,7 +159,7 @@ def yaml_values(text: str) -> object:
         mark = getattr(error, "problem_mark", None)
         where = "" if mark is None else f" in line {mark.line + 1}, column {mark.column + 1}"
         raise ValueError(
-            f"it is no YAML: {getattr(error, 'problem', None) or error}{where}"
+            f"it is not YAML: {getattr(error, 'problem', None) or error}{where}"
         ) from error
 
 
@@ -183,7 +183,7 @@ def _check_yaml(events: Iterable[object]) -> None:
         elif isinstance(event, yaml.AliasEvent):
             if event.anchor not in anchored:
                 raise ValueError(
-                    f"its alias *{event.anchor} stands for nothing, or for what it is a part of"
+                    f"its alias *{event.anchor} is undefined, or refers to a part that contains it"
                 )
             counts[-1] += anchored[event.anchor]
         elif isinstance(event, yaml.ScalarEvent):
@@ -205,10 +205,13 @@ def check_size(shape: Sequence[int], what: str) -> None:
     total = 1
     for n in shape:
         if int(n) < 1:
-            raise ValueError(f"{what} has the shape {tuple(shape)}: it holds nothing")
+            raise ValueError(f"{what} has the shape {tuple(shape)}: it is empty")
         total *= int(n)
     if total > MOST_READINGS:
-        raise ValueError(f"{what} has the shape {tuple(shape)}: too large to be true")
+        raise ValueError(
+            f"{what} has the shape {tuple(shape)}, too large for a scan or volume: its header is "
+            "probably damaged"
+        )
 
 
 def check_expansion(
@@ -233,8 +236,8 @@ def check_expansion(
         held = packed() if callable(packed) else packed
         if size > _MOST_EXPANSION * held:
             raise ValueError(
-                f"{what} of {size / 2**30:.3g} GiB is packed into {held / 2**20:.3g} MiB: no scan "
-                "or volume is so empty"
+                f"{what} of {size / 2**30:.3g} GiB is compressed to {held / 2**20:.3g} MiB, more "
+                f"than {_MOST_EXPANSION} times: the file is damaged, or not a scan or volume"
             )
     free = free_bytes()
     if size > free:

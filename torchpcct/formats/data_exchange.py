@@ -246,7 +246,9 @@ def angles_in(data: h5py.Dataset, views: int, what: str, of: slice | Bools = sli
     """
     angles = np.asarray(data[()], dtype=np.float64).ravel()
     if angles.size != views:
-        raise ValueError(f"{data.name} has {angles.size} angles, {what} {views} views")
+        raise ValueError(
+            f"{data.name} has {angles.size} angles, {what} {views} views: give angles_deg="
+        )
     angles = angles[of]
     unit = next(
         (unit_text(data.attrs[name]) for name in ("units", "unit") if name in data.attrs), ""
@@ -263,15 +265,15 @@ def angles_in(data: h5py.Dataset, views: int, what: str, of: slice | Bools = sli
     turns = round((span + 0.5 * step) / math.pi)
     if 1 <= turns <= _HALF_TURNS and -0.01 <= turns * math.pi - span <= 1.5 * step:
         warnings.warn(
-            f"its angles, {data.name}, have no unit and run over {span:.4g}: they are taken for "
-            f"rad, {turns} half turn{'s' * (turns > 1)}",
+            f"its angles, {data.name}, have no unit and cover {span:.4g}: they are taken as rad, "
+            f"{turns} half turn{'s' * (turns > 1)}; angles_deg= sets them",
             UserWarning,
             stacklevel=2,
         )
         return angles
     if span <= _LARGEST_RAD and angles.size > 1:
         raise ValueError(
-            f"its angles, {data.name}, have no unit and run over {span:.4g}: deg or rad? Give "
+            f"its angles, {data.name}, have no unit and cover {span:.4g}: deg or rad? Give "
             "angles_deg="
         )
     return np.deg2rad(angles)

@@ -281,11 +281,11 @@ def _from_one_spot(
         where = (
             f"between {len(positions)} positions"
             if len(positions) > 1
-            else "and where to is not said"
+            else "to positions that the file does not give"
         )
         raise ValueError(
             f"{folder}: its focal spot flies ({kind}) {where}: pass spot=0 for the views from the "
-            "first position, or ignore_flying_spot=True to take it for one at rest"
+            "first position, or ignore_flying_spot=True to treat it as fixed"
         )
     return views, positions[0]
 

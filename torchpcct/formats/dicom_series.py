@@ -308,8 +308,8 @@ def read_dicom(
         data, grid = _joined(slices)
     if replaced:
         warnings.warn(
-            f"{path}: {replaced} of {data.size} pixels are padding about the picture, not tissue, "
-            f"and read as air, {_AIR:.0f} HU",
+            f"{path}: {replaced} of {data.size} pixels are padding around the image, and are read "
+            f"as air, {_AIR:.0f} HU",
             UserWarning,
             stacklevel=3,
         )
@@ -338,7 +338,7 @@ def _hounsfield(d: pydicom.Dataset, unit: str | None, ours: bool) -> tuple[Float
     held = {name: d.get(name) for name in ("RescaleSlope", "RescaleIntercept")}
     missing = [name for name, value in held.items() if value in (None, "")]
     if missing and unit is None:
-        raise ValueError(f"it has no {' and no '.join(missing)}: its numbers are no HU{_KNOWN}")
+        raise ValueError(f"it has no {' and no '.join(missing)}: its values are not HU{_KNOWN}")
     slope = 1.0 if "RescaleSlope" in missing else float(held["RescaleSlope"])
     intercept = 0.0 if "RescaleIntercept" in missing else float(held["RescaleIntercept"])
     if not (np.isfinite([slope, intercept]).all() and slope != 0):
@@ -368,8 +368,7 @@ def _check_ct(d: pydicom.Dataset) -> None:
     ):
         units = f" in {d.Units}" if d.get("Units") else ""
         raise ValueError(
-            f"it is of the modality {modality or 'unknown'}{units}, whose numbers are no HU: only "
-            "CT is"
+            f"its modality is {modality or 'unknown'}{units}: only CT images are in HU"
         )
 
 
@@ -431,9 +430,13 @@ def _joined(slices: list[_Slice]) -> tuple[Floats32, VolumeGrid]:
     gaps = np.diff(z)
     if gaps.size and (gaps.min() <= 0 or np.ptp(gaps) > 0.01 * float(np.median(gaps))):
         at = int(np.argmax(np.abs(gaps - np.median(gaps))))
-        raise ValueError(f"slices lack or repeat between z = {z[at]:g} and {z[at + 1]:g} mm")
+        raise ValueError(
+            f"slices are missing or repeated between z = {z[at]:g} and {z[at + 1]:g} mm"
+        )
     if count and count != len(slices):
-        raise ValueError(f"it holds {len(slices)} of the {count} slices of its series")
+        raise ValueError(
+            f"it has {len(slices)} of the {count} slices of its series: copy the others, too"
+        )
     drift = np.abs(np.array([s.position[:2] for s in slices]) - slices[0].position[:2]).max()
     if drift > 0.01 * min(pixel):
         raise ValueError("its slices are shifted against each other (gantry tilt)")

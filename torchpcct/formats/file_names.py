@@ -53,9 +53,9 @@ def matching(pattern: str, folder: Path) -> list[Path]:
         other = stems.setdefault((path.with_suffix(""), _kind(path.suffix[1:])), path)
         if other is not path:
             raise ValueError(
-                f"{other} and {path.name} both match {pattern}, one image twice: leave one of them "
-                f"there, or put a letter of the ending in brackets, as {pattern[:-1]}"
-                f"[{pattern[-1]}], to mean it alone"
+                f"{other} and {path.name} both match {pattern}, one image twice: remove one of "
+                f"them, or put a letter of the ending in brackets, as {pattern[:-1]}"
+                f"[{pattern[-1]}], to match it alone"
             )
     return in_number_order(files)
 
@@ -104,8 +104,8 @@ def in_number_order(paths: Sequence[Path]) -> list[Path]:
                 ", ".join(text[k].name for k in order[:_SHOWN]) for order in (taken, other)
             )
             warnings.warn(
-                f"the names of {len(text)} files leave their order open: they are read as {asked} "
-                f"(by the numbers), not as {instead}; a list of the names decides",
+                f"the names of {len(text)} files do not determine their order: they are read as "
+                f"{asked} (by the numbers), not as {instead}; a list of the names sets it",
                 UserWarning,
                 stacklevel=2,
             )

@@ -256,8 +256,8 @@ def adapted(
     if pitch is not None:
         if not (g.on_circle and g.parallel):
             raise ValueError(
-                f"pitch= is the cell width of parallel beams, this is a {kind}: its geometry says "
-                "it"
+                f"pitch= is the cell width of parallel beams, this is a {kind}, whose geometry has "
+                "it: leave it out"
             )
         wide = number("pitch", pitch, positive=True, unit="mm")
         g = replace(g, pitch=wide, offset=g.offset * wide / g.pitch)
@@ -274,7 +274,7 @@ def adapted(
         mu = number("mu_water", mu_water, positive=True, unit="mm⁻¹")
         if scan.unit != "mm^-1":
             known = (
-                "it does not know the size of its pixels: give pitch=, too"
+                "the size of its pixels is unknown: give pitch=, too"
                 if scan.unit == "pixel^-1"
                 else (
                     f"the attenuation of water, {scan.linearisation.mu_ref:.5g} mm⁻¹, is known to "
@@ -286,8 +286,8 @@ def adapted(
     if photons is not None:
         if not scan.logged:
             raise ValueError(
-                "photons= belongs to line integrals, this scan holds readings, which tell their "
-                "photons"
+                "photons= applies to line integrals; this scan has readings, which determine the "
+                "number of photons: leave it out"
             )
         air = torch.full_like(scan.air, number("photons", photons, positive=True))
         ratio = (air / scan.air).unsqueeze(-len(g.shape))

@@ -100,7 +100,10 @@ def read_stack(
     text = read_yaml(path, "the description of a scan")
     with reading(path, "the description of a scan"):
         if not isinstance(text, Mapping):
-            raise ValueError("it is no mapping with readings, kind and geometry")
+            raise ValueError(
+                "it is not a mapping with readings, kind and geometry: torchpcct show-config "
+                "--stack prints an example"
+            )
         given = {**text, **known}
         kind = choice("kind", given.pop("kind", None), ("counts", "line_integrals"))
         described = given.pop("geometry", None)
@@ -121,7 +124,9 @@ def read_stack(
                 f"{', '.join(sorted(allowed))}"
             )
         if kind == "counts" and "air" not in given:
-            raise ValueError("counts need air, the readings without the object")
+            raise ValueError(
+                "kind: counts needs air:, the readings without the object (a file or a number)"
+            )
     options: dict[str, Any] = {
         k: read_array(v, folder) if k in _FILES and _is_name(v) else v for k, v in given.items()
     }

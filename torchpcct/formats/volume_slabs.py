@@ -95,8 +95,8 @@ class SlabFile:
         for there in (self.part, self.journal):
             if not kept and (there.exists() or there.is_symlink()):
                 raise FileExistsError(
-                    f"{there} is there and is no unfinished volume of torchpcct: move it, or name "
-                    f"another file than {path}"
+                    f"{there} exists and is not an unfinished volume of torchpcct: move it, or "
+                    f"name another file than {path}"
                 )
         _require_own(self.path)
         self.store = self.path.suffix.lower() == ".zarr"
@@ -410,7 +410,7 @@ def _unit_of(axis: object) -> str:
     unit = "" if given is None else unit_text(np.array(given))
     if unit and unit not in MM:
         raise ValueError(
-            f"its lengths are in {unit!r}, which is no known unit: write them in millimeter, "
+            f"its lengths are in the unknown unit {unit!r}: write them in millimeter, "
             "micrometer or another power of ten of a meter"
         )
     return unit

@@ -61,8 +61,15 @@ def cnr(foreground_means: ArrayLike, background_means: ArrayLike) -> float | Flo
 def cnr_from_moments(
     fg_mean: ArrayLike, fg_sd: ArrayLike, bg_mean: ArrayLike, bg_sd: ArrayLike
 ) -> float | Floats:
-    """CNR from published means and standard deviations across realisations (any broadcastable
-    shapes).
+    """CNR from published means and standard deviations across realisations.
+
+    Args:
+        fg_mean, bg_mean: mean over the realisations of the mean of the foreground's and of the
+            background's ROI, HU; any shapes that broadcast.
+        fg_sd, bg_sd: standard deviation of these ROI means over the realisations, HU.
+
+    Returns:
+        ``(bg_mean − fg_mean) / sqrt(fg_sd² + bg_sd²)``: a float, or an array of the common shape.
 
     Raises:
         ValueError: a negative standard deviation, or both zero (noise-free data have no CNR);
@@ -169,9 +176,16 @@ def cnr_range(
         means: ``(foreground, background)`` expectations in HU.
         covariance: ``(2, 2)`` covariance of the two ROI means in HU².
         realizations: size of the experiment, at least 3.
+        level: probability that the range covers, in (0, 1).
+        draws: simulated experiments, whose quantiles are the range.
+        seed: of these draws.
+
+    Returns:
+        Lower and upper end.
 
     Raises:
-        ValueError: fewer than 3 realisations, or a covariance that is not positive definite.
+        ValueError: fewer than 3 realisations, a level outside (0, 1), or a covariance that is not
+            positive definite.
     """
     if realizations < 3:
         raise ValueError(f"realizations must be at least 3, got {realizations}")

@@ -145,14 +145,14 @@ def noise_at_equal_resolution(
     for name, pair in zip(("method", "reference"), pairs, strict=True):
         if any(np.ptp(v) <= 1e-6 * np.abs(v).max() for v in pair):
             raise ValueError(
-                f"the {name} has a constant volume: it shows nothing, so nothing can be said of "
-                "its noise"
+                f"the {name} has a constant volume, whose noise cannot be measured: check that the "
+                "volume was read correctly"
             )
         one, other = pair
         if np.array_equal(one, other):
             raise ValueError(
-                f"the {name} has two volumes that are the same: they must be of two scans, or two "
-                "halves"
+                f"the {name} has two equal volumes: give those of two scans, or of two halves of "
+                "one"
             )
     mask = np.ones(shape, bool) if region is None else np.asarray(region, bool)
     if mask.shape != shape or mask.sum() < 2:

@@ -123,14 +123,32 @@ class HalfSplit:
         return frequency, np.asarray(shown / np.maximum(given, 1e-300), dtype=np.float64)
 
     def f50(self, reference: HalfSplit, grid_spacing: float) -> float:
-        """Frequency at which :meth:`transfer` falls to ½, line pairs per mm; inf if it does not
-        as far as is known."""
+        """Spatial frequency at which :meth:`transfer` falls to ½.
+
+        Args:
+            reference: halves of a reconstruction of the same scan without smoothing.
+            grid_spacing: of the voxels in the slice, mm.
+
+        Returns:
+            Line pairs per mm; inf if the transfer stays above ½ at all measured frequencies.
+
+        Raises:
+            ValueError: another shape than that of the reference.
+        """
         return first_below(*self.transfer(reference, grid_spacing), 0.5, math.inf)
 
     def within(self, rows: slice, columns: slice) -> HalfSplit:
-        """A rectangle of every slice, for the frequencies of what lies in it alone: its mean taken
-        off, and faded to 0 at its border (Hann), so that the cut shows no edges. A strong edge
-        elsewhere would speak for the whole image.
+        """A rectangle of every slice, whose frequencies are then measured without those of strong
+        edges elsewhere in the image.
+
+        The mean of the rectangle is subtracted and a Hann window fades it to 0 at its border, so
+        that the cut itself is no edge.
+
+        Args:
+            rows, columns: of the rectangle, slices along y and x.
+
+        Returns:
+            Halves of the shape ``(…, rows, columns)``, float64.
         """
 
         def part(volume: Tensor) -> Tensor:

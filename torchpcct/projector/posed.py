@@ -291,7 +291,7 @@ class _OnceOnly(torch.autograd.Function):
     @staticmethod
     def backward(ctx: object, *gradients: Tensor) -> NoReturn:
         raise NotImplementedError(
-            "readings are piecewise linear in the geometry: a second derivative by it says "
-            "nothing. Use the first (Gauss-Newton), or detach the geometry's tensors where you "
-            "differentiate by the volume"
+            "projections are piecewise linear in the geometry, so that second derivatives with "
+            "respect to it carry no information. Use first derivatives (Gauss-Newton), or detach "
+            "the geometry's tensors where you differentiate with respect to the volume"
         )

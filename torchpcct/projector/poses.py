@@ -98,8 +98,8 @@ class ParametricGeometry:
         if self.bend:
             if set(self.parameters) - {"offset", "angles"}:
                 raise ValueError(
-                    "vectors describe flat detectors only, this one is curved: only offset and "
-                    "angles of it can be settled"
+                    "vectors describe flat detectors only, and this one is curved: only its offset "
+                    "and angles can be applied"
                 )
             angles = self.parameters.get("angles")
             made = base if angles is None else _with_angles(base, angles)

@@ -175,8 +175,17 @@ class SiliconDetector:
         return 0.0
 
     def interaction(self, energies_kev: ArrayLike) -> tuple[Floats, Floats]:
-        """Probability of a (photoelectric, Compton) interaction in the sensitive silicon per
-        incident photon."""
+        """Probability of an interaction in the sensitive silicon.
+
+        Args:
+            energies_kev: of the incident photons, ``(E,)``.
+
+        Returns:
+            Photoelectric and Compton interactions per incident photon, two arrays ``(E,)`` float64.
+
+        Raises:
+            ValueError: energies outside the cross-section table.
+        """
         photo, compton = (
             MATERIALS["silicon"].attenuation(energies_kev, kind) for kind in ("photo", "incoh")
         )
@@ -195,8 +204,18 @@ class SiliconDetector:
         return self._above(energies_kev, thresholds_kev, 0.0)
 
     def photons_above(self, energies_kev: ArrayLike, thresholds_kev: ArrayLike) -> Floats:
-        """Photons that count at least once, per incident photon, arguments as of :meth:`above`:
-        without charge sharing the same; with it a photon may count in two cells, or in none."""
+        """Photons that count at least once, per incident photon.
+
+        Without charge sharing this equals :meth:`above`; with it a photon may count in two cells,
+        or in none.
+
+        Args:
+            energies_kev: of the incident photons, ``(E,)``.
+            thresholds_kev: ``(thresholds,)``.
+
+        Returns:
+            ``(thresholds, E)`` float64.
+        """
         return self._above(energies_kev, thresholds_kev, 1.0)
 
     def _above(self, energies_kev: ArrayLike, thresholds_kev: ArrayLike, both: float) -> Floats:

@@ -116,7 +116,14 @@ class Bowtie:
         object.__setattr__(self, "thickness_mm", thickness)
 
     def thickness(self, fan_angles_rad: ArrayLike) -> Floats:
-        """Path length in mm at fan angles in rad (either sign), same shape, float64."""
+        """Path length through the filter.
+
+        Args:
+            fan_angles_rad: of either sign, of any shape.
+
+        Returns:
+            Lengths in mm, of the same shape, float64; beyond the last node that of the last node.
+        """
         # Rounded to the picometre: slopes near the smallest float overflow inside the interpolator.
         nodes, values = np.array(self.fan_angles_rad), np.round(self.thickness_mm, 9)
         curve = PchipInterpolator(np.r_[-nodes[:0:-1], nodes], np.r_[values[:0:-1], values])
@@ -125,7 +132,18 @@ class Bowtie:
         )
 
     def transmission(self, fan_angles_rad: ArrayLike, energies_kev: ArrayLike) -> Floats:
-        """Transmitted share of the photons, ``(angles, E)``."""
+        """Transmitted share of the photons.
+
+        Args:
+            fan_angles_rad: of either sign, ``(angles,)``.
+            energies_kev: ``(E,)``.
+
+        Returns:
+            ``(angles, E)`` float64 in 0 … 1.
+
+        Raises:
+            ValueError: energies outside the cross-section table.
+        """
         return np.exp(
             -np.multiply.outer(
                 self.thickness(fan_angles_rad), self.material.attenuation(energies_kev)

@@ -357,6 +357,7 @@ class TransportedSilicon(SiliconDetector):
         transport_seed: of them.
         stack: sheets and foils; ``fill_factor`` must be the share of the pitch that the foils
             leave.
+        Others: see :class:`torchpcct.scanner.detector.SiliconDetector`.
 
     Raises:
         ValueError: ``fill_factor`` that contradicts the foils; charge sharing or pile-up, which are

@@ -185,6 +185,11 @@ class Ellipsoid(Shape):
 
     Args:
         semi_axes: the three semi-axes along the local x, y, z in mm, or one number for a sphere.
+        position: ``(x, y, z)`` of the local origin in mm (default: the isocentre).
+        rotation: angle about z in rad, or the 3 × 3 matrix of the local axes (default: none).
+
+    Raises:
+        ValueError: lengths that are not positive, a position or rotation that is not one.
     """
 
     semi_axes: Any
@@ -218,6 +223,11 @@ class EllipticCylinder(Shape):
         semi_axes: the two semi-axes of the section along the local x and y in mm, or one number for
             a circle.
         half_length: half the height in mm; ``inf`` (the default) for an endless cylinder.
+        position: ``(x, y, z)`` of the local origin in mm (default: the isocentre).
+        rotation: angle about z in rad, or the 3 × 3 matrix of the local axes (default: none).
+
+    Raises:
+        ValueError: lengths that are not positive, a position or rotation that is not one.
     """
 
     semi_axes: Any
@@ -266,6 +276,11 @@ class Box(Shape):
 
     Args:
         half_lengths: half the edge lengths along the local x, y, z in mm, or one number for a cube.
+        position: ``(x, y, z)`` of the local origin in mm (default: the isocentre).
+        rotation: angle about z in rad, or the 3 × 3 matrix of the local axes (default: none).
+
+    Raises:
+        ValueError: lengths that are not positive, a position or rotation that is not one.
     """
 
     half_lengths: Any

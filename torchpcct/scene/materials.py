@@ -218,7 +218,12 @@ class Material:
         )
 
     def with_density(self, density_g_cm3: float, name: str | None = None) -> Material:
-        """The same composition at another density."""
+        """The same composition at another density.
+
+        Args:
+            density_g_cm3: greater than 0.
+            name: of the new material; None: that of this one.
+        """
         return Material(self.name if name is None else name, density_g_cm3, self.mass_fractions)
 
 
@@ -235,14 +240,32 @@ def formula_mass_fractions(formula: Mapping[str, float]) -> dict[str, float]:
 
 @checked
 def compound(name: str, density_g_cm3: float, formula: Mapping[str, float]) -> Material:
-    """A material from its molecular formula, e.g. ``compound("water", 1.0, {"H": 2, "O": 1})``."""
+    """A material from its molecular formula, e.g. ``compound("water", 1.0, {"H": 2, "O": 1})``.
+
+    Args:
+        name: of the material.
+        density_g_cm3: its density.
+        formula: chemical symbol → number of atoms.
+
+    Raises:
+        ValueError: an unknown element, no atom at all, a density that is not positive.
+    """
     return Material(name, density_g_cm3, formula_mass_fractions(formula))
 
 
 @checked
 def mixture(name: str, density_g_cm3: float, parts: Mapping[Material, float]) -> Material:
-    """A mixture by *mass* at a given density; the shares must sum to 1 within
-    :data:`FRACTION_TOLERANCE`."""
+    """A mixture by *mass* at a given density.
+
+    Args:
+        name: of the mixture.
+        density_g_cm3: its density.
+        parts: material → mass fraction; they must sum to 1 within :data:`FRACTION_TOLERANCE`.
+
+    Raises:
+        ValueError: a fraction below 0 or not finite, fractions with another sum, a density that is
+            not positive.
+    """
     fractions: dict[str, float] = {}
     for part, share in parts.items():
         if not (math.isfinite(share) and share >= 0):
@@ -257,7 +280,15 @@ def mixture(name: str, density_g_cm3: float, parts: Mapping[Material, float]) ->
 @checked
 def blend(name: str, parts: Mapping[Material, float]) -> Material:
     """A mixture by *volume*: density and attenuation are the volume-weighted means of the parts
-    (ideal mixing)."""
+    (ideal mixing).
+
+    Args:
+        name: of the mixture.
+        parts: material → volume fraction; they must sum to 1 within :data:`FRACTION_TOLERANCE`.
+
+    Raises:
+        ValueError: a fraction below 0 or not finite, or fractions with another sum.
+    """
     shares = {part: float(share) for part, share in parts.items()}
     total = sum(shares.values())
     if abs(total - 1.0) > FRACTION_TOLERANCE:
@@ -274,11 +305,15 @@ def blend(name: str, parts: Mapping[Material, float]) -> Material:
 def solution(
     solute: Material | str, mg_per_ml: float, solvent: Material | str = "water"
 ) -> Material:
-    """So many mg of one material in every ml of the whole, in another: contrast agents, calibration
-    rods.
+    """A solution of one material in another: contrast agents, calibration rods.
 
-    Volumes add: of iodine the element's own, 0.2 % for 10 mg/ml. By name: ``"iodine 10 mg/ml in
-    blood"``.
+    Volumes add; iodine takes that of the element, 0.2 % for 10 mg/ml. By name: ``"iodine 10 mg/ml
+    in blood"``.
+
+    Args:
+        solute: the dissolved material or its name.
+        mg_per_ml: mass of the solute in a ml of the solution.
+        solvent: the other material or its name.
 
     Raises:
         ValueError: a concentration below 0, or above the density of the solute.

@@ -68,6 +68,13 @@ class SinusoidalMotion:
         return np.stack([-self.amplitude * self._unit, self.amplitude * self._unit])
 
     def scaled(self, fraction: ArrayLike) -> SinusoidalMotion:
-        """The same motion with ``fraction`` times the amplitude (residual motion after gating)."""
+        """The same motion with another amplitude, such as the residual motion after gating.
+
+        Args:
+            fraction: the amplitude is multiplied by this number.
+
+        Raises:
+            ValueError, TypeError: a fraction that is not a finite number.
+        """
         scaled = self.amplitude * number("fraction", fraction)
         return SinusoidalMotion(self.body, scaled, self.rate_bpm, self.phase, self.direction)

@@ -210,8 +210,17 @@ class Scene:
         return offsets
 
     def bounding_box(self, names: str | Sequence[str] | None = None) -> Floats:
-        """A box that holds the named bodies (all, by default) at all times of their motion,
-        ``(2, 3)`` mm."""
+        """The smallest box that contains bodies at all times of their motion.
+
+        Args:
+            names: of the bodies; None: all.
+
+        Returns:
+            Lowest and highest corner, ``(2, 3)``: x, y, z in mm.
+
+        Raises:
+            ValueError: a name that no body has.
+        """
         wanted = (
             self.names if names is None else ((names,) if isinstance(names, str) else tuple(names))
         )
@@ -364,8 +373,20 @@ class Scene:
         return np.tensordot(levels, fractions, axes=1) + outside
 
     def material_map(self, grid: VolumeGrid, energy_kev: float, oversample: int = 16) -> Floats:
-        """Linear attenuation coefficient of each voxel at one photon energy, mm⁻¹,
-        ``grid.shape`` float64; at rest."""
+        """Linear attenuation coefficient of each voxel at one photon energy, at rest.
+
+        Args:
+            grid: of the voxels.
+            energy_kev: photon energy, a number.
+            oversample: sub-voxels along each axis where a body's surface crosses a voxel.
+
+        Returns:
+            mm⁻¹, the mean over each voxel, ``grid.shape`` float64.
+
+        Raises:
+            ValueError: several energies, or one that is not positive or outside the cross-section
+                table.
+        """
         energy = np.atleast_1d(np.asarray(energy_kev, dtype=np.float64))
         if energy.size != 1 or not energy[0] > 0:
             raise ValueError(

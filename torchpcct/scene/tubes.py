@@ -114,6 +114,8 @@ class BulgedTube(_Tube):
             local +x.
         bulge_length: length in mm of the deformed segment, centred at the local z = 0.
         half_length: half the tube's length in mm; ``inf`` for an endless tube.
+        position: ``(x, y, z)`` of the local origin in mm (default: the isocentre).
+        rotation: angle about z in rad, or the 3 × 3 matrix of the local axes (default: none).
     """
 
     def section(self, z: ArrayLike) -> tuple[Floats, Floats, Floats]:
@@ -137,6 +139,8 @@ class NarrowedTube(_Tube):
         amplitude: largest ``d(0)`` in mm (≥ 0).
         bulge_length: length in mm of the narrowed segment, centred at the local z = 0.
         half_length: half the tube's length in mm; ``inf`` for an endless tube.
+        position: ``(x, y, z)`` of the local origin in mm (default: the isocentre).
+        rotation: angle about z in rad, or the 3 × 3 matrix of the local axes (default: none).
     """
 
     def section(self, z: ArrayLike) -> tuple[Floats, Floats, Floats]:

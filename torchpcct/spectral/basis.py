@@ -64,8 +64,17 @@ class Basis:
         return self.first.name, self.second.name
 
     def attenuation(self, energies_kev: ArrayLike) -> Floats:
-        """``(2, ...)`` μ₁ and μ₂ in mm⁻¹ at energies of shape ``(...)`` in keV; ``ValueError``
-        outside 1…500 keV."""
+        """Linear attenuation coefficients of the two basis materials.
+
+        Args:
+            energies_kev: photon energies, ``(...)``.
+
+        Returns:
+            μ₁ and μ₂ in mm⁻¹, ``(2, ...)`` float64.
+
+        Raises:
+            ValueError: energies outside 1 … 500 keV.
+        """
         return np.stack(
             [self.first.attenuation(energies_kev), self.second.attenuation(energies_kev)]
         )

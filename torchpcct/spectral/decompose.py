@@ -205,7 +205,11 @@ def _check_bins(counts: Floats, model: SpectralModel, column: Ints) -> None:
             f"{text}: set lower thresholds, or a higher tube voltage, or sum the bins and "
             "reconstruct HU"
         )
-    warnings.warn(f"{text}: their line integrals hang on single photons", UserWarning, stacklevel=4)
+    warnings.warn(
+        f"{text}: their line integrals depend on single photons; expose longer, or sum the bins",
+        UserWarning,
+        stacklevel=4,
+    )
 
 
 @checked

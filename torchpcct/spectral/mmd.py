@@ -167,7 +167,17 @@ def _nearest(x: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
 
 @checked
 def label(fractions: Tensor) -> Tensor:
-    """Index of the largest fraction, ``(K, ...)`` → ``(...)`` int64."""
+    """The tissue with the largest fraction in each voxel.
+
+    Args:
+        fractions: volume fractions of K tissues, ``(K, ...)``, floating point.
+
+    Returns:
+        Index of the tissue, ``(...)`` int64.
+
+    Raises:
+        TypeError: fractions of another dtype, or without an axis of tissues.
+    """
     if not fractions.is_floating_point() or not fractions.ndim:
         raise TypeError(
             f"fractions must be a floating point tensor (K, ...), got {fractions.dtype}"

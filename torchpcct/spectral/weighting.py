@@ -292,15 +292,15 @@ def weighted_scan(scan: Any, weights: Any, scanner: Scanner | None = None) -> An
     if scan.counts.ndim != 4 or not scan.counting or scan.logged:
         raise ValueError(
             f"weights sum photon counts in energy bins (bins, views, rows, columns), this is "
-            f"{scan!r}: acquire with presets.pcct(mode='spectral'), and weigh it once"
+            f"{scan!r}: acquire with presets.pcct(mode='spectral'), and weight it once"
         )
     bins, columns = scan.counts.shape[0], scan.geometry.columns
     values = _values(weights, (bins, columns))
     scanner = scanner or getattr(weights, "scanner", None)
     if scanner is None:
         raise ValueError(
-            "these weights do not say of which scanner they are, and its spectra make the water "
-            "correction: give scanner=, or weights of bin_weights"
+            "the water correction needs the scanner that these weights belong to: give scanner=, "
+            "or make the weights with bin_weights"
         )
     if not isinstance(scanner, Scanner):
         raise TypeError(f"scanner must be a Scanner, got {type(scanner).__name__}")

@@ -1,1 +1,1 @@
-"""What the paper says (``facts``); how its plaque is scanned and read (``plaque_scan``)."""
+"""What the paper states (``published``); its plaque scan and measurements (``plaque_scan``)."""

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from recon.analytic.inset import InsetFbp
-from recon.study.paper import facts as paper
+from recon.study.paper import published as paper
 from recon.study.spectral.scan import BODIES, SpectralScan, Tissues
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S
 from torchpcct.scanner import Scanner, SiliconDetector, TransportedSilicon

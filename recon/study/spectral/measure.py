@@ -33,7 +33,7 @@ from recon.jobs.store import Pieces, Step
 from recon.least_squares.basis_problem import BasisProblem
 from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.study.figures import extent
-from recon.study.paper import facts as paper
+from recon.study.paper import published as paper
 from recon.study.report import Check, around
 from recon.study.spectral.calibration import calibration_costs
 from recon.study.spectral.scan import RULES, SpectralScan, Tissues

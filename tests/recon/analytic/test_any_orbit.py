@@ -143,7 +143,7 @@ def test_what_fbp_cannot_do_is_refused():
     with pytest.raises(ValueError, match=r"table travels by 20\.00 mm.*recon\.pwls"):
         fbp(data, CONE, VolumeGrid((2, 8, 8), 2.0), motion=helical_motion(CONE, 20.0 * 180 / 179))
     before = np.concatenate([v[:, :3], 1.5 * v[:, :3], v[:, 6:]], 1)
-    with pytest.raises(ValueError, match="does not stand behind the axis"):
+    with pytest.raises(ValueError, match="does not lie behind its source"):
         rebin_to_circle(data, VectorGeometry(before, CONE.columns, CONE.rows))
     tilted = np.concatenate([-v[:, :3], v[:, 3:]], 1)
     tilted[:, 2] = 20.0
@@ -151,5 +151,5 @@ def test_what_fbp_cannot_do_is_refused():
         rebin_to_circle(data, VectorGeometry(tilted, CONE.columns, CONE.rows, parallel=True))
     # 0.8 m to either side
     edge_on = VectorGeometry.of(replace(CONE, pitch=(1.6, 15.0))).turned(slant=1.45)
-    with pytest.raises(ValueError, match="a detector reaches behind its source"):
+    with pytest.raises(ValueError, match="part of a detector lies behind its source"):
         rebin_to_circle(data, edge_on)

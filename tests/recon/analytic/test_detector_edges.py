@@ -94,7 +94,7 @@ def test_shares_of_a_pair_add_up_to_one_and_vanish_at_the_short_edge():
         assert share[np.abs(u).argmax()] == 1.0
         short = share[0] if u[-1] > -u[0] else share[-1]
         assert 0.0 <= short < 2e-3
-    with pytest.raises(ValueError, match="does not reach the projection of the rotation axis"):
+    with pytest.raises(ValueError, match="lie on one side of the projection of the rotation axis"):
         offset_share(np.arange(10) + 3.0)
 
 

@@ -142,11 +142,11 @@ def test_what_is_refused(task, folder):
     refused(
         ("iodine or two materials A/B, got 'gold'", lambda: check_method("fbp:soft,energies=gold")),
         ("unknown material 'wader'", lambda: check_method("pwls:energies=wader/bone")),
-        ("is given none", lambda: check_method("files:out,energies=iodine")),
+        ("reads volumes", lambda: check_method("files:out,energies=iodine")),
         ("option of evaluations", lambda: split_method("fbp:soft,energies=iodine")),
-        ("paint their tissues", lambda: evaluate(painted, OWN, n=8, folder=folder)),
+        ("are given in HU, without energies", lambda: evaluate(painted, OWN, n=8, folder=folder)),
         (
-            "painted in HU",
+            "given in HU",
             lambda: EnergyRealisations(Realisations(painted, Store(folder / "t")), "", ()),
         ),
         (

@@ -345,7 +345,7 @@ def test_pieces_of_another_seed_method_or_exposure_are_not_taken(task, tmp_path)
         ("nothing", "unknown method"),
         ("bilateral@pwls", "needs FBP"),
         ("no.such.module:run", "cannot load"),
-        ("files:nowhere", "no folder"),
+        ("files:nowhere", "no such folder"),
         ("json:loads@nowhere", "unknown method"),
         (3, "must be a name"),
     ],
@@ -407,9 +407,9 @@ def test_volumes_of_another_program(here, cli):
     cli(f"{command} --out p")
     Volume(volume.data, VolumeGrid(volume.grid.shape, 0.4)).save(first)
     shutil.rmtree(here / "volumes" / "insert" / "20s_000_present")
-    assert "lies on" in cli(f"{command} --out q", 2)
+    assert "has the grid" in cli(f"{command} --out q", 2)
     first.unlink()
-    assert "holds no volume" in cli(f"{command} --out q", 2)
+    assert "has no volume" in cli(f"{command} --out q", 2)
 
 
 @pytest.mark.parametrize("slices", [False, True])
@@ -471,7 +471,7 @@ def test_commands(here, cli):
     assert "fbp:detail" in again
     other = cli("evaluate --task insert.yaml --method fbp:soft --n 9 --out o --no-progress")
     assert "my_own_filter" not in other
-    assert "needs a base" in cli(f"{command} --denoiser my_own_filter:half --out o", 2)
+    assert "does not name the method" in cli(f"{command} --denoiser my_own_filter:half --out o", 2)
     (here / "f").write_bytes(b"mine")
     assert "is a file" in cli(f"{command} --out f", 2)
 
@@ -501,7 +501,7 @@ def test_two_measured_scans(task, folder):
     assert not soft["why"]
     with pytest.raises(ValueError, match="two of the same object"):
         evaluate_scans([scans[0], object()], task.grid, "fbp:soft")
-    with pytest.raises(ValueError, match="one scan makes one pair"):
+    with pytest.raises(ValueError, match="one scan gives one pair"):
         evaluate_scans(scans[0], task.grid, "fbp:soft", n=2)
 
 
@@ -552,17 +552,17 @@ def test_volumes_in_two_folders(here, cli):
     )
     cli("evaluate --volumes one two --region mask.nii.gz --out masked")
     for options, expected in (
-        ("--reference other", "hold fbp, half, mine"),
-        ("--n 9", "--n is of --scans"),
+        ("--reference other", "both have fbp, half, mine"),
+        ("--n 9", "--n applies to --scans"),
         ("--task rod", "simulated"),
         ("--region 9:,:,:", "0 voxels"),
-        ("--region nowhere", "neither a file nor ranges"),
+        ("--region nowhere", "neither an existing file nor ranges"),
         ("--method pwls", "--scans"),
     ):
         assert expected in cli(f"evaluate --volumes one two {options} --out m", 2)
     assert not (here / "m").exists()
     assert "no such file: no" in cli("evaluate --volumes one no", 2)
-    assert "is no folder" in cli("evaluate --volumes one mask.nii.gz", 2)
+    assert "is not a folder" in cli("evaluate --volumes one mask.nii.gz", 2)
     assert "with --scans or --volumes" in cli("evaluate --task rod --region 1:2,3:4,5:6", 2)
     reference = pairs.pop("fbp")
     with pytest.raises(ValueError, match="shape"):

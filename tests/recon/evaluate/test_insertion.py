@@ -184,7 +184,7 @@ def test_slices_are_measured_one_by_one(fan):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"balls": [InsertedBall(60.0, 10.0)]}, "no room for a ball of 60 mm"),
+        ({"balls": [InsertedBall(60.0, 10.0)]}, r"a ball of 60 mm, \+10 HU fits nowhere"),
         ({"places": [[1.0, 2.0, 3.0]]}, r"rows of 2 numbers in mm, \(y, x\)"),
         ({"places": [[30.0, 0.0]]}, "reaches beyond the grid"),
         ({"places": [[0.0, 0.0], [0.0, 5.0]]}, "5 mm apart"),
@@ -198,7 +198,7 @@ def test_bad_input_is_named_before_anything_runs(given, message, fan, monkeypatc
     def never(*_args, **_options):
         raise AssertionError("a reconstruction was started")
 
-    if "no room" not in message:
+    if "fits nowhere" not in message:
         monkeypatch.setattr("recon.evaluate.insertion.reconstruct", never)
     arguments = {"methods": "fbp:soft", "balls": [InsertedBall(3.0, 50.0)], **given}
     with pytest.raises(ValueError, match=message):

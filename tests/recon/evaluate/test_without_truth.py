@@ -105,7 +105,7 @@ def test_views_are_exchanged_with_their_flux(scans):
     (row,) = evaluate_scans([first, dimmer], grid, "fbp:ram-lak", n=2, seed=1)
     (plain,) = evaluate_scans(scans, grid, "fbp:ram-lak")
     assert row["noise"] == pytest.approx(plain["noise"], rel=0.1)
-    with pytest.raises(ValueError, match="of one exposure only"):
+    with pytest.raises(ValueError, match="of the same exposure only"):
         evaluate_scans([first, replace(second, air=second.air / 2)], grid, "fbp:soft", n=2)
 
 

@@ -308,7 +308,7 @@ def test_a_lambda_is_computed_here(task, process, tmp_path, caplog):
     mine = Method("mine", lambda realisation: realisation.fbp("soft"), kernels=("soft",))
     found = evaluate(task, ["fbp:soft", mine], n=8, folder=tmp_path, executor=process)
     assert {r["method"] for r in found.records} == {"fbp:soft", "mine"}
-    assert "mine is computed here, not by other processes" in caplog.text
+    assert "mine is computed in this process" in caplog.text
 
 
 def test_without_an_executor_jobs_are_run_here_as_they_are(tmp_path):

@@ -75,7 +75,7 @@ def test_what_cannot_be_kept_is_refused():
         with pytest.raises(TypeError, match="a piece of a study cannot hold"):
             packed(value)
     foreign = {"tree": np.array(json.dumps({"made": ["os", "path", {}]}))}
-    with pytest.raises(ValueError, match="no dataclass of this software"):
+    with pytest.raises(ValueError, match="not a dataclass of this software"):
         unpacked(foreign)
 
 
@@ -161,7 +161,7 @@ def test_a_piece_does_not_replace_a_file_of_the_user(tmp_path, caplog):
     )
     assert (tmp_path / "x.npz").read_bytes() == mine
     assert store.piece("y", "key", lambda: 8) == 7
-    assert "x.npz is no piece of a study: it is left as it is" in caplog.text
+    assert "x.npz is not a stored result of a study: it is left unchanged" in caplog.text
 
 
 def test_one_name_is_one_piece(tmp_path):

@@ -175,8 +175,8 @@ def test_nan_of_a_prior_is_named(clean, problem):
         ("perona", r"unknown prior of mbir 'perona': use one of .*did you mean"),
         ("no.such.module:run", "cannot load 'no.such.module:run': No module named"),
         ("json:nothing", "cannot load 'json:nothing': module 'json' has no attribute"),
-        ("json:__version__", "no attribute|no function"),
-        ("json:decoder", "json:decoder is no function"),
+        ("json:__version__", "no attribute|not a function"),
+        ("json:decoder", "json:decoder is not a function"),
     ],
 )
 def test_what_is_no_prior_is_named(given, text):
@@ -378,7 +378,7 @@ def test_priors_in_the_name_of_a_method(saved, nets):
     assert trained.network.fidelity == 1.0
     assert trained.network.model.voxel_mm == VOXEL
     for bad, text in (
-        (f"mbir:network={nets}:MyNet", "give it with weights=FILE"),
+        (f"mbir:network={nets}:MyNet", "give weights=FILE, too"),
         (
             f"mbir:weights={path},network=MyNet",
             "network of mbir must be package.module:Class, got 'MyNet'",
@@ -413,12 +413,12 @@ def test_the_library_and_the_command_take_the_same_names(clean, nets, here, cli)
         reconstruct(clean, grid, "fbp", kernel="soft").data,
     )
     with pytest.raises(
-        TypeError, match=r"fidelity stands in the method 'mbir:fidelity=1,.* and beside it"
+        TypeError, match=r"fidelity is given in the method 'mbir:fidelity=1,.* and as an argument"
     ):
         reconstruct(scan, grid, spec, fidelity=0.5)
     for words, text in (
-        (f"--method {spec} --fidelity 1", "--fidelity stands in --method"),
-        (f"--method mbir --network {nets}:MyNet", "give it with --weights FILE"),
+        (f"--method {spec} --fidelity 1", "--fidelity is given in --method"),
+        (f"--method mbir --network {nets}:MyNet", "give its --weights FILE, too"),
         (
             f"--method mbir --network {nets} --weights scan.h5",
             "--network must be package.module:Class",

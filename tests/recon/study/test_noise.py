@@ -22,7 +22,7 @@ from recon.study.noise import (
     resampled_tables,
     table_checks,
 )
-from recon.study.paper import facts as paper
+from recon.study.paper import published as paper
 from recon.study.paper.plaque_scan import inset_grid
 from torchpcct.metrics.intervals import resampling
 from torchpcct.metrics.placement import RoiRule, place_rois

@@ -5,8 +5,8 @@ import pytest
 from tiny_studies import assert_report_is_whole
 
 from recon.motion import InsetMotion, Jump, PathTooLongError
-from recon.study import motion_found
-from recon.study.motion_found import JumpMotion
+from recon.study import motion_estimates
+from recon.study.motion_estimates import JumpMotion
 from recon.study.paths import KINDS, SMOOTH, _together, compared, drawn
 
 
@@ -52,9 +52,9 @@ def test_a_path_that_leads_too_far_is_no_end_of_a_study(monkeypatch):
     def too_far(scan, grid):
         raise PathTooLongError("2.7 mm")
 
-    monkeypatch.setattr(motion_found, "estimate_motion", too_far)
-    assert motion_found.motion_or_refusal(None, None) is None
-    row = motion_found._row([None, None], np.ones((4, 3)))
+    monkeypatch.setattr(motion_estimates, "estimate_motion", too_far)
+    assert motion_estimates.motion_or_refusal(None, None) is None
+    row = motion_estimates._row([None, None], np.ones((4, 3)))
     assert (row["refused"], row["held"], row["error_mm"]) == (2, 0, None)
 
 

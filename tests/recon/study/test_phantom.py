@@ -5,7 +5,7 @@ import copy
 import pytest
 from tiny_studies import assert_report_is_whole
 
-from recon.study.paper import facts as paper
+from recon.study.paper import published as paper
 from recon.study.phantom import TRANSMITTED, analytic_lengths, checks, raster_lengths
 from torchpcct.scene.materials import MATERIALS
 from torchpcct.scene.plaque import plaque_scene

@@ -161,7 +161,7 @@ def test_refusals(clean, problem):
             lambda: reconstruct(clean, GRID, "mbir", vessel_prior=VesselPrior(), vessel=False),
         ),
         (
-            "known stands beside vessel or tissues",
+            "known is given as well as vessel or tissues",
             lambda: reconstruct(clean, GRID, "mbir", tissues=True, known=KnownVessel()),
         ),
         (

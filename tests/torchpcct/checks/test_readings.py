@@ -314,7 +314,7 @@ def test_at_the_edge_the_other_axis_serves_and_then_the_nearest():
     full = interpolate_dead(lines.masked_fill(mask, 1e9), mask, rows=True, most=1.0)
     torch.testing.assert_close(full[1:, :, 0], lines[1:, :, 1])
     torch.testing.assert_close(full[0, :, 1:], lines[1, :, 1:])
-    with pytest.raises(ValueError, match="no live reading is left"):
+    with pytest.raises(ValueError, match="all readings are dead"):
         interpolate_dead(lines, torch.ones_like(mask), rows=True, most=1.0)
 
 

@@ -86,10 +86,10 @@ def test_angles_without_a_unit(exchange):
         (np.linspace(0, 2 * np.pi, 60), "2 half turns"),
     ):
         rewritten(exchange, "exchange/theta", span)
-        with pytest.warns(UserWarning, match=f"have no unit .* taken for rad, {turns}"):
+        with pytest.warns(UserWarning, match=f"have no unit .* taken as rad, {turns}"):
             np.testing.assert_allclose(open_scan(exchange).geometry.angles, span)
     rewritten(exchange, "exchange/theta", 0.6 * GEOMETRY.angles)
-    with pytest.raises(ValueError, match=r"have no unit and run over 1\.854: deg or rad"):
+    with pytest.raises(ValueError, match=r"have no unit and cover 1\.854: deg or rad"):
         open_scan(exchange)
 
 
@@ -230,7 +230,7 @@ def test_numbers_that_lie_in_other_files_are_refused_by_name(tmp_path, form, kin
         else:  # 2 GiB of nothing
             file.create_dataset(name, (len(data), 2**10, 2**14), "u2", chunks=(1, 2**10, 2**10))
     expected = (
-        "is packed into 0 MiB"
+        "is compressed to 0 MiB"
         if kind == "empty"
         else r"other\.(h5|raw).*copy all into one file first"
     )

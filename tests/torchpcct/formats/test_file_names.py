@@ -61,7 +61,7 @@ def test_orders_that_are_clear_are_taken_without_a_word(tmp_path, names):
 def test_where_text_and_numbers_differ_and_nothing_decides_the_order_is_said(tmp_path, names):
     with pytest.warns(
         UserWarning,
-        match=rf"leave their order open: they are read as {names[0]}.* \(by the numbers\)",
+        match=rf"do not determine their order: they are read as {names[0]}.* \(by the numbers\)",
     ):
         assert ordered(tmp_path, names) == names
 

@@ -79,7 +79,7 @@ def test_without_a_pixel_size_lengths_are_in_pixels(tmp_path, size, unit):
     torch.testing.assert_close(pixels.data, 0.5 * 0.04 * (1 + hu.data / 1000), atol=1e-6, rtol=1e-4)
     pixels.save(tmp_path / "v.nii.gz")
     assert (pixels.unit, Volume.load(tmp_path / "v.nii.gz").unit) == ("pixel^-1", "pixel^-1")
-    with pytest.raises(ValueError, match="does not know the size of its pixels: give pitch=, too"):
+    with pytest.raises(ValueError, match="the size of its pixels is unknown: give pitch=, too"):
         open_scan(path, mu_water=0.04)
 
 
@@ -446,11 +446,11 @@ LAUGHS = "\n".join(
     [
         (LAUGHS, "stands for more than 1048576 values"),
         ("[" * 60 + "]" * 60, "nested more than 32 deep"),
-        ("a: &a [1, *a]", r"alias \*a stands for nothing, or for what it is a part of"),
+        ("a: &a [1, *a]", r"alias \*a is undefined, or refers to a part that contains it"),
         ("a: " + "1:" * 40000 + "1", "more than 16384 characters"),
         ("# " + "x" * 2**24, "more than 16777216 characters"),
-        ("a: [", "it is no YAML: .* in line 2"),
-        ("a: !!python/object:os.system {}", "it is no YAML"),
+        ("a: [", "it is not YAML: .* in line 2"),
+        ("a: !!python/object:os.system {}", "it is not YAML"),
         (b"a: \xff\xfe".decode("latin-1"), None),
     ],
 )

@@ -245,11 +245,11 @@ def test_dicom_series_appear_whole_or_not_at_all(tmp_path, monkeypatch):
     Volume(DATA, GRID).save(tmp_path / "s")
     shutil.copy(tmp_path / "s" / "0004.dcm", tmp_path / "last.dcm")
     (tmp_path / "s" / "0004.dcm").unlink()
-    with pytest.raises(ValueError, match="it holds 3 of the 4 slices"):
+    with pytest.raises(ValueError, match="it has 3 of the 4 slices"):
         Volume.load(tmp_path / "s")
     for name in ("0004.dcm", "0005.dcm"):
         shutil.copy(tmp_path / "last.dcm", tmp_path / "s" / name)
-    with pytest.raises(ValueError, match="slices lack or repeat between z"):
+    with pytest.raises(ValueError, match="slices are missing or repeated between z"):
         Volume.load(tmp_path / "s")
 
 
@@ -358,10 +358,10 @@ def _pet(d):
         (lambda d: setattr(d, "RescaleType", "HU_MOD"), "its RescaleType is HU_MOD, not HU"),
         (lambda d: setattr(d, "RescaleType", "Z_EFF"), "its RescaleType is Z_EFF, not HU"),
         (_no_rescale, "it has no RescaleSlope and no RescaleIntercept"),
-        (lambda d: delattr(d, "RescaleSlope"), "it has no RescaleSlope: its numbers are no HU"),
+        (lambda d: delattr(d, "RescaleSlope"), "it has no RescaleSlope: its values are not HU"),
         (lambda d: setattr(d, "RescaleSlope", "0"), "its RescaleSlope is 0"),
-        (_pet, "it is of the modality PT in BQML, whose numbers are no HU"),
-        (lambda d: setattr(d, "Modality", "MR"), "it is of the modality MR"),
+        (_pet, "its modality is PT in BQML: only CT images are in HU"),
+        (lambda d: setattr(d, "Modality", "MR"), "its modality is MR"),
         (lambda d: setattr(d, "NumberOfFrames", 2), "it holds 2 frames"),
     ],
 )
@@ -407,7 +407,7 @@ def _padded(value, marked, limit=None, vr="SS"):
 def test_padding_about_the_picture_is_air_and_said(series, value, change, inside):
     folder = series(change)
     with pytest.warns(
-        UserWarning, match=r"of 120 pixels are padding about the picture, .* read as air, -1000 HU"
+        UserWarning, match=r"of 120 pixels are padding around the image, .* read as air, -1000 HU"
     ):
         data = Volume.load(folder).data
     expected = DATA.flip(1, 2).clone()

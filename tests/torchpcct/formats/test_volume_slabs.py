@@ -137,7 +137,7 @@ def test_other_software_may_leave_out_chunks_of_the_fill_value(tmp_path):
 @pytest.mark.parametrize(
     ("attributes", "said"),
     [
-        (image(unit="furlong"), "its lengths are in 'furlong', which is no known unit: write"),
+        (image(unit="furlong"), "its lengths are in the unknown unit 'furlong': write"),
         (image("xyz"), "its axes are x, y, z.*write it with its axes in that order"),
         (image("yx", scale=(1.0, 1.0)), "its axes are y, x"),
         (image(scale=(2.0, 1.0)), "its scale has 2 numbers, of 3 axes"),

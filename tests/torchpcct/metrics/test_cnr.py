@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from recon.study.paper import facts as paper
+from recon.study.paper import published as paper
 from torchpcct.metrics import cnr, cnr_from_moments, cnr_interval, sd_interval
 
 

@@ -142,7 +142,7 @@ def test_nothing_can_be_said_of_noise_alone():
     ("method", "said"),
     [
         (lambda r: pair(np.ones(SHAPE), np.ones(SHAPE)), "constant"),
-        (lambda r: pair(r[0], r[0]), "the same"),
+        (lambda r: pair(r[0], r[0]), "equal volumes"),
         (lambda r: pair(r[0][1:], r[1][1:]), "one shape"),
     ],
 )

@@ -304,7 +304,7 @@ def test_what_is_refused(clean, iodine):
         ("give scanner=", lambda: clean.weighted(np.ones((8, 48)))),
         ("real numbers", lambda: clean.weighted("iodine")),
         ("scanner must be a Scanner", lambda: clean.weighted(np.ones((8, 48)), "pcct")),
-        ("weigh it once", lambda: clean.weighted(iodine).weighted(iodine)),
+        ("weight it once", lambda: clean.weighted(iodine).weighted(iodine)),
         (r"bin 3 of 8 .*32…42 keV\) has not counted", lambda: silent.weighted(iodine)),
         ("unknown weights 'bin'", lambda: weighting_gain(SCANNER, LUMEN, FAT, "bin")),
     )

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from recon.jobs.store import Pieces
 from recon.motion import InsetMotion, PathTooLongError, estimate_motion
-from recon.study.paper import facts as paper
+from recon.study.paper import published as paper
 from recon.study.paper.plaque_scan import SCANNERS, duty
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
