@@ -211,9 +211,9 @@ def _followed(
         farthest = float(np.abs(problem.path(at)).max())
         if farthest > REACH_MM:
             raise PathTooLongError(
-                f"the path that fits leads {farthest:.2g} mm away from its mean, more than the "
-                f"{REACH_MM:g} mm that are looked for: the inset moves too far in this scan, or "
-                "what it holds is too faint for its motion to be found"
+                f"the estimated path reaches {farthest:.2g} mm from its mean, more than the "
+                f"{_REACH_MM:g} mm that are searched: the inset moves too far in this scan, or its "
+                "content is too faint; give the displacement in every view, motion=path"
             )
         effects = now if largest < _NEAR_MM else None
         tell(step / (_STEPS + 1))
