@@ -212,7 +212,7 @@ def _followed(
         if farthest > REACH_MM:
             raise PathTooLongError(
                 f"the estimated path reaches {farthest:.2g} mm from its mean, more than the "
-                f"{_REACH_MM:g} mm that are searched: the inset moves too far in this scan, or its "
+                f"{REACH_MM:g} mm that are searched: the inset moves too far in this scan, or its "
                 "content is too faint; give the displacement in every view, motion=path"
             )
         effects = now if largest < _NEAR_MM else None
