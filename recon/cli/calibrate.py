@@ -88,13 +88,14 @@ def add_calibrate(commands: Commands) -> None:
         commands,
         "calibrate",
         _calibrate,
-        "find a scan's geometry from the object itself",
-        "Find numbers of a scan's geometry from its readings, with standard errors, and write the "
-        "geometry for reconstruct --geometry. The whole object must be seen in all views. What "
-        "the readings do not determine is refused.",
+        "estimate a scan's geometry from the object itself",
+        "Estimate parameters of a scan's geometry from its readings, with standard errors, and "
+        "write the geometry for reconstruct --geometry. The whole object must lie in the field of "
+        "view in all views. Parameters that the readings do not determine are refused.",
         "torchpcct calibrate tooth.h5 --free offset,roll --out tooth.yaml",
         "torchpcct reconstruct tooth.h5 --geometry tooth.yaml --out tooth.nii.gz",
         out="geometry to write, .yaml (default SCAN_geometry.yaml)",
+        draws=False,
     )
     add_options(
         parser,

@@ -188,7 +188,7 @@ def _planned_export(
 
 
 def _measured(arguments: argparse.Namespace, out: Path) -> None:
-    """Measured scans or volumes, of which nobody knows the truth: table, page and files."""
+    """Measured scans or volumes, without a known ground truth: table, page and files."""
     from recon.evaluate.report import measured_text, save_measured
 
     of_tasks = {
@@ -444,7 +444,7 @@ def add_evaluate(commands: Commands) -> None:
             "with --scans: of the volume, Z Y X",
             {"nargs": "+", "limits": PLACE},
         ),
-        group="measured scans and volumes, of which nobody knows the truth",
+        group="measured scans and volumes, without a known ground truth",
     )
     add_options(
         parser,

@@ -217,6 +217,8 @@ def command(
     before: str = "",
     required: bool = False,
     seed: int | None = 0,
+    draws: bool = True,
+    on_device: bool = False,
 ) -> Parser:
     """A command with its examples and, if it makes files, with the options of all that do.
 
@@ -225,6 +227,9 @@ def command(
         out: help of ``--out``; "": the command has none of the common options. required: ``--out``
             has no default.
         seed: default of ``--seed``; None: the configuration's.
+        draws: whether the command uses random numbers and so has ``--seed``.
+        on_device: whether it computes on a GPU; otherwise ``--device`` is not shown, and refused
+            with a remedy if it is given.
     """
     parser: Parser = commands.add_parser(name, help=help, description=description)
     examples(parser, *lines, before=before)
@@ -234,20 +239,22 @@ def command(
     parser.set_defaults(run=run)
     default = "the configuration's, or 0" if seed is None else f"{seed}"
     add_options(parser, ("--out", Path, "PATH", out, {"required": required}))
+    seeds = (
+        "--seed",
+        int,
+        None,
+        f"seed of the random numbers, of the first realisation if there are several, ≥ 0 (default "
+        f"{default})",
+        {"default": seed, "limits": _SEED},
+    )
     add_options(
         parser,
-        (
-            "--seed",
-            int,
-            None,
-            f"first seed of the noise, ≥ 0 (default {default})",
-            {"default": seed, "limits": _SEED},
-        ),
+        *((seeds,) if draws else ()),
         (
             "--device",
             str,
             None,
-            "where to reconstruct (default cpu)",
+            "where to compute (default cpu)" if on_device else argparse.SUPPRESS,
             {"choices": ("cpu", "cuda"), "default": "cpu"},
         ),
         FORCE,

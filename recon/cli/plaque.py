@@ -116,7 +116,7 @@ def add_plaque(commands: Commands) -> None:
             "--beside",
             str,
             None,
-            "read these images, too",
+            "measure in these images, too",
             {"nargs": "*", "default": [], "choices": ("pwls", "mbir")},
         ),
         ("--voxel", float, "MM", "voxel size (default 0.2)", {"default": 0.2, "limits": length}),

@@ -492,14 +492,17 @@ def add_reconstruct(commands: Commands) -> None:
         "reconstruct",
         _reconstruct,
         "reconstruct a scan file to a volume",
-        "Reconstruct a scan, ours or a foreign one, and write the volume, with what was done "
-        "beside (.json, .yaml). Many scans go into a folder, each SCAN_METHOD.nii.gz.",
+        "Reconstruct a scan, of torchpcct or of another program, and write the volume, with a "
+        "record of the command beside it (.json, .yaml). Volumes of many scans are written into a "
+        "folder, each as SCAN_METHOD.nii.gz.",
         "torchpcct reconstruct tooth.h5 --find-axis --out tooth.nii.gz",
         "torchpcct reconstruct scan.h5 --method mbir --fidelity 1 --out mbir.nii.gz",
         "torchpcct reconstruct scans/*.h5 --out volumes --workers 4",
         out="folder of many scans; of one, volume to write: .nii, .nii.gz, .mha, .h5, .zarr, or "
         "no ending for DICOM "
         "(default SCAN_METHOD.nii.gz)",
+        draws=False,
+        on_device=True,
     )
     own = "for separate slices only Y X"
     add_options(

@@ -110,7 +110,7 @@ def add_reader_options(parser: Parser, many: bool = False) -> None:
             "of a flying focal spot: only the views from its position K",
             {"limits": {"low": 0, "high": 63}},
         ),
-        group="what the file does not know of its scan",
+        group="properties of the scan that the file lacks",
     )
 
 

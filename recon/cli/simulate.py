@@ -164,8 +164,8 @@ def add_simulate(commands: Commands) -> None:
         _simulate,
         "simulate a scan to an HDF5 file",
         "Simulate a scan of any scene (--config, see show-config) or, without one, of the paper's "
-        "plaque by the deep-silicon PCCT, and write it to HDF5, with what was done beside (.json, "
-        ".yaml).",
+        "plaque by the deep-silicon PCCT, and write it to HDF5, with a record of the command "
+        "(.json, .yaml).",
         "torchpcct simulate --exposure 2 --out plaque.h5",
         "torchpcct show-config > scene.yaml; torchpcct simulate --config scene.yaml --out scan.h5",
         out="HDF5 file to write",
@@ -254,7 +254,7 @@ def add_lower_dose(commands: Commands) -> None:
         "lower-dose",
         _lower_dose,
         "a measured scan as if it had been taken with less dose",
-        "Write a scan, ours or a foreign one, as it would have been at a fraction of its dose, "
+        "Write a scan, of torchpcct or of another program, as if taken at a fraction of its dose, "
         "noise included. Photon counts are thinned, which is exact; other readings get the right "
         "mean and variance. Refused where the number of photons is not known.",
         "torchpcct lower-dose scan.h5 --fraction 0.25 --out quarter.h5",

@@ -151,7 +151,7 @@ def _doctor(arguments: argparse.Namespace, progress: ProgressBars) -> int:
 def add_doctor(commands: Commands) -> None:
     parser = commands.add_parser(
         "doctor",
-        help="is all installed, and does it compute what it should? seconds",
+        help="check the installation and a few computations: seconds",
         description="Print versions, processor, GPU, threads and the folder of compiled kernels, "
         "check the shipped "
         "weights, test the projector's adjoint, and reconstruct a disc of known value: for an "

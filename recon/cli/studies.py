@@ -194,7 +194,7 @@ def add_verify(commands: Commands) -> None:
         commands,
         "verify",
         _verify,
-        "do README and RESULTS.md say what the committed reports say?",
+        "check README.md and RESULTS.md against the committed reports",
         "Render the results again from the committed reports (notebooks/results.template.md) and "
         "compare; compute studies again if asked.",
         "torchpcct verify --write",

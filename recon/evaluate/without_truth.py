@@ -1,4 +1,4 @@
-"""Methods on measured data, where nobody knows the truth: two scans of one object, or one scan in
+"""Methods on measured data, without a known ground truth: two scans of one object, or one scan in
 two halves.
 
 What two independent scans agree on is signal, what they do not is noise. A blur buys low noise with
