@@ -211,7 +211,7 @@ def test_a_dead_column_and_a_dead_view_are_repaired_and_named(clean, method):
     broken[70] = 0
     good = reconstruct(scan, GRID, method)
     repaired = reconstruct(replace(scan, counts=broken), GRID, method)
-    assert "dead detector cells, 1 views without signal" in repaired.report["warnings"][0]
+    assert "dead detector cells, 1 view without signal" in repaired.report["warnings"][0]
     # The noise of a good scan at this dose is the measure.
     noise = float((good.data - reconstruct(clean, GRID, method).data).std())
     assert float((repaired.data - good.data).square().mean().sqrt()) < noise

@@ -210,7 +210,7 @@ def test_readings_that_are_lost_for_a_while_are_counted_and_harmless(method, lin
     ]
     assert [v.report["dead_readings"] for v in volumes] == [0, 30]
     first, *others = volumes[1].report["warnings"]
-    assert first.startswith("1 cells that were dead for part of the views")
+    assert first.startswith("1 cell that was dead for part of the views")
     assert len(others) == len(volumes[0].report["warnings"])
     assert float((volumes[1].data - volumes[0].data).std()) < 0.5 * float(
         volumes[0].data[8:16, 8:16].std()

@@ -92,13 +92,17 @@ class Defects:
     def text(self) -> str:
         """What was found, one sentence; empty if nothing."""
         parts = (
-            (self.dead_cells, "dead detector cells"),
-            (self.hot_cells, "cells of a wrong gain"),
-            (self.dead_views, "views without signal"),
-            (self.dead_for_a_while, "cells that were dead for part of the views"),
-            (self.lost_readings, "single lost readings"),
+            (self.dead_cells, "dead detector cell", "dead detector cells"),
+            (self.hot_cells, "cell of a wrong gain", "cells of a wrong gain"),
+            (self.dead_views, "view without signal", "views without signal"),
+            (
+                self.dead_for_a_while,
+                "cell that was dead for part of the views",
+                "cells that were dead for part of the views",
+            ),
+            (self.lost_readings, "single lost reading", "single lost readings"),
         )
-        found = ", ".join(f"{n} {what}" for n, what in parts if n)
+        found = ", ".join(f"{n} {one if n == 1 else more}" for n, one, more in parts if n)
         if not found:
             return ""
         share = 100 * int(self.mask.count_nonzero()) / self.mask.numel()

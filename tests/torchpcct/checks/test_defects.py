@@ -71,8 +71,8 @@ def test_every_kind_of_defect_is_found_and_nothing_else(counts):
         1,
     )
     assert (
-        "13 dead detector cells, 1 cells of a wrong gain, 1 views without signal, 1 single lost"
-        in found.text
+        "13 dead detector cells, 1 cell of a wrong gain, 1 view without signal, 1 single lost "
+        "reading:" in found.text
     )
 
 
