@@ -111,19 +111,19 @@ def estimate_motion(
     texts = []
     if not held:
         texts.append(
-            "the readings hold no motion of the inset: the path that fits best has "
+            "the readings show no motion of the inset: the best fitting path has "
             f"{size:.2g} ± {error:.2g} mm, root mean square; none is applied"
         )
     if jump is not None:
         texts.append(
             f"the inset jumps by {jump.length:.2g} ± {jump.error:.2g} mm at view {jump.view} of "
-            f"{len(path)}: its motion is not smooth; the path holds the jump"
+            f"{len(path)}: its motion is not smooth; the path contains the jump"
         )
     if after**2 > _CHANCE * quiet**2 + _ANOTHER * problem.left_by_model:
         texts.append(
-            "what the inset leaves of the readings along the path is more than noise "
-            f"({after:.2g} times): it does not move as one rigid body along one path, parts of "
-            "it may move differently, turn or jump"
+            "the residual of the readings along the path exceeds the noise "
+            f"({after:.2g} times): the inset does not move as one rigid body along one path, parts "
+            "of it may move differently, turn or jump"
         )
     for text in texts:
         _LOG.warning("%s", text)

@@ -166,7 +166,7 @@ def test_no_motion_is_invented():
     assert not found.path.any()
     assert found.rms_mm < 0.04
     assert found.errors.max() < 0.1
-    assert "hold no motion" in found.warnings[0]
+    assert "show no motion" in found.warnings[0]
 
 
 @pytest.mark.extended

@@ -81,8 +81,8 @@ def column_test(lines: Tensor, geometry: Geometry) -> ScanTest:
     findings = [gain_text] if gain_text else []
     if abs(place) - _SIGMAS * error > PLACE_TOLERANCE:
         findings.append(
-            f"the columns of even and of odd number lie about {abs(place):.1f} columns beside "
-            f"their places, to either side ({abs(place) / error:.0f} standard errors): "
+            f"the columns of even and of odd number are displaced by about {abs(place):.1f} "
+            f"columns in opposite directions ({abs(place) / error:.0f} standard errors): "
             "neighbouring columns are exchanged, or interleaved the wrong way; edges are torn; "
             "sort the columns"
         )

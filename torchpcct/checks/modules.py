@@ -203,6 +203,6 @@ def _text(low: int, high: int, mirrored: int, middle: bool, size: float, error: 
         f"conjugate rays disagree in the columns {low} … {high}, or those on the other side of the "
         f"axis ({mirrored - high} … {mirrored - low}), by a displacement of about {abs(size):.2f} "
         f"± {2.0 * error:.1g} columns{part} that the others do not have: a module of the detector "
-        "lies beside its place, or its columns were sorted into others; edges behind it are torn "
+        "is displaced, or its columns are in the wrong order; edges behind it are torn "
         "or double; give the true positions, or mask it (dead=)"
     )

@@ -158,7 +158,7 @@ def moment_test(lines: Tensor, geometry: Geometry) -> ScanTest:
         findings.append(
             f"the object lies about {axial:.2g} mm higher or lower in the course of the turn (root "
             f"mean square, {axial / axial_error:.0f} standard errors): it moved along the axis, or "
-            "the table did (a helix told as a circle); give the motion"
+            "the table did (a helix described as a circle); give the motion"
         )
     elif weight - _SIGMAS * weight_error > WEIGHT_TOLERANCE + lacks:
         findings.append(

@@ -450,8 +450,8 @@ class _Views:
                 f"the last view (number {self.number[-1]}) does not lead back to the first "
                 f"({self.number[0]}): they differ by {abs(size):.2g} times what neighbouring views "
                 f"do {sure}: something moved on during the turn (a table that travels, a helix "
-                "told as a circle, an object that sinks or breathes), or the range of the angles "
-                "is wrong; give the motion or the true angles"
+                "described as a circle, an object that sinks or breathes), or the range of the "
+                "angles is wrong; give the motion or the true angles"
             )
         pair = f"the views {self.number[most]} and {self.number[(most + 1) % n]}"
         more = f" (and {len(at) - 1} more pairs)" if len(at) > 1 else ""
