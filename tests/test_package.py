@@ -47,6 +47,14 @@ def test_importing_loads_nothing_that_is_used_later(package, more):
     }
 
 
+def test_no_method_loads_the_compiler_of_torch():
+    """Which takes more than a second of every process."""
+    code = "import sys, recon.api, recon.mbir, recon.evaluate.experiment; print(*sys.modules)"
+    loaded = set(run_python(code).stdout.split())
+    assert "torch" in loaded
+    assert not loaded & {"torch._dynamo", "sympy"}
+
+
 def test_one_version():
     """It stands in torchpcct/files.py; pyproject.toml reads it there, citation and changelog
     follow."""

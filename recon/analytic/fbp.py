@@ -7,7 +7,7 @@ import logging
 import math
 import warnings
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol, TypeVar, cast
 
@@ -436,6 +436,9 @@ class Fbp(nn.Module):
         self._enter()
 
     def _enter(self) -> None:
+        global _apart
+        if is_free(self.motion) and _apart is None:
+            _apart = torch.compiler.disable(Fbp._computed)
         self._handle = next(_HANDLES)
         _LAYERS[self._handle] = self
 
@@ -446,13 +449,9 @@ class Fbp(nn.Module):
 
     def forward(self, sinogram: Tensor) -> Tensor:
         if is_free(self.motion):
-            return self._apart(sinogram)
+            return (_apart or Fbp._computed)(self, sinogram)
         if torch.compiler.is_compiling():
             return cast(Tensor, _traced(sinogram, self._handle))
-        return self._computed(sinogram)
-
-    @torch.compiler.disable  # one operation of a traced graph knows no gradient by the motion
-    def _apart(self, sinogram: Tensor) -> Tensor:
         return self._computed(sinogram)
 
     def _computed(self, sinogram: Tensor) -> Tensor:
@@ -473,6 +472,9 @@ _LAYERS: weakref.WeakValueDictionary[int, Fbp] = weakref.WeakValueDictionary()
 """Layers by their handles."""
 _HANDLES = itertools.count()
 """Those that were given out."""
+_apart: Callable[[Fbp, Tensor], Tensor] | None = None
+"""What traced graphs leave out: one operation of them knows no gradient by the motion. Made with
+the first layer that has such a motion, as it loads torch's compiler, a second of work."""
 
 
 @torch.library.custom_op(

@@ -1,6 +1,7 @@
 """Scans: files, logarithms, refusals."""
 
 import copy
+import math
 import pickle
 from dataclasses import replace
 
@@ -16,6 +17,7 @@ from recon.analytic.inset import InsetFbp
 from torchpcct import (
     ConeBeam,
     FanBeam,
+    ParallelBeam,
     Scan,
     VectorGeometry,
     Volume,
@@ -286,3 +288,20 @@ def test_scans_geometries_and_volumes_print_in_a_few_lines():
     assert "720 × 2 × 888 line integrals" in repr(scan)
     assert "0 … 0 HU, fbp" in repr(volume)
     assert set(torchpcct.__all__) <= set(dir(torchpcct))
+
+
+@pytest.mark.parametrize("photons", [3.0, 10.0, 40.0])
+def test_weights_of_few_photons_do_not_follow_the_noise_of_their_readings(photons):
+    """A weighted mean of line integrals is theirs: bright readings weighed more, which lowered it
+    by a fifth of a photon."""
+    geometry = ParallelBeam(full_turn(400), 400, 1.0)
+    counts = np.random.default_rng(0).poisson(photons, geometry.shape).astype(float)
+    scan = Scan.from_counts(counts, geometry, air=4.0 * photons)
+    weights, lines = scan.weights().double(), scan.line_integrals().double()
+    error = float((weights * lines).sum() / weights.sum()) - math.log(4.0)
+    assert abs(error) < 0.02 / photons + 4.0 / math.sqrt(photons * counts.size)
+    changed = counts.copy()
+    changed[200, 200] += 5.0
+    other = Scan.from_counts(changed, geometry, air=4.0 * photons).weights()
+    assert other[200, 200] == scan.weights()[200, 200]
+    assert other[200, 201] > scan.weights()[200, 201]
