@@ -23,7 +23,9 @@ iterations for each exact pair, which need neither the accuracy nor the memory o
 One K is enough in a plane and for parallel rays. A circular orbit of a cone beam does not: its
 middle slice has all frequencies, but 36 mm off it, 400 mm from the source, frequencies (f_r, f_z)
 with f_r < 0.09 f_z are seen by no ray (Tuy 1983, SIAM J. Appl. Math. 43:546). A preconditioner that
-takes them for well seen hardly moves flat faces there.
+takes them for well seen hardly moves flat faces there. Nor is any of these a model of such waves
+that one could solve with: of a volume those that change slowly in the plane are taken from a
+coarser scan (:mod:`recon.least_squares.coarse_scan`), the sectors have the rest.
 """
 
 from __future__ import annotations
@@ -42,6 +44,7 @@ from torch import Tensor
 
 from recon.conjugate_gradient import conjugate_gradient
 from recon.gram.gram import REFERENCE_FREQUENCY, check_weights, information_at
+from recon.least_squares.coarse_scan import CoarseScan, coarse_scan
 from recon.least_squares.model_solver import mean_share
 from recon.least_squares.qggmrf import BoundPrior
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam
@@ -76,6 +79,9 @@ INNER_REDUCTION = 0.03
 VIEWS_A_TRANSFORM = 5.0
 """Views that are projected, both ways, in the time of a Fourier transform and its inverse (3 in a
 plane, 5.5 in a volume, on one core). As many iterations are made as take the time of one pair."""
+INNER_OF_VOLUMES = 8
+"""Iterations where the model has a coarser scan. Of thin plates 5 to 10 took 4.7 to 5.6 s and 35 to
+29 pairs, of a thorax 2.1 to 2.7 s and 16 to 13."""
 
 
 class FieldModel:
@@ -159,6 +165,12 @@ class FieldModel:
         return list(zip([outer[0], *inner, outer[1]], _shares(slices, self.seen), strict=True))
 
     @cached_property
+    def coarse(self) -> CoarseScan | None:
+        """What knows the waves of a volume that change slowly in the plane; None where there is
+        none."""
+        return coarse_scan(self._projector, self._weights)
+
+    @cached_property
     def terms(self) -> list[tuple[Tensor, Tensor]]:
         """Spectra, ``rfftn`` layout or what broadcasts to it, and D_b of the model's terms.
 
@@ -166,13 +178,14 @@ class FieldModel:
         asked for; by slices where these have a K of their own, or where the directions of the rays
         are not known.
         """
-        if len(self.nodes) > 1 or self._ways is None:
-            return [(k, share * self.scale.sqrt()) for k, share in self.nodes]
+        rest = 1.0 if self.coarse is None else self.coarse.rest
+        if self._ways is None or (self.coarse is None and len(self.nodes) > 1):
+            return [(rest * k, share * self.scale.sqrt()) for k, share in self.nodes]
         project, weights, size = self._projector, self._weights, self.grid.shape[-2:]
         impulse = torch.zeros_like(self.seen)
         impulse[self.at] = 1.0
         lines = project(impulse)
-        spectrum = _periodic(project.T(lines), self.at)
+        spectrum = rest * _periodic(project.T(lines), self.at)
         # Rays along the crests of a wave see it.
         fy, fx = (
             f(n) / h
@@ -195,7 +208,7 @@ class FieldModel:
     def apply(self, x: Tensor) -> Tensor:
         """The model of AᵀWA x, ``(..., *grid.shape)``."""
         axes = tuple(range(-self.grid.ndim, 0))
-        out = torch.zeros_like(x)
+        out = torch.zeros_like(x) if self.coarse is None else self.coarse.apply(x)
         for spectrum, spread in self.terms:
             waves = torch.fft.rfftn(spread * x, dim=axes).mul_(spectrum)
             out += spread * torch.fft.irfftn(waves, s=self.grid.shape, dim=axes)
@@ -230,6 +243,7 @@ class FieldModel:
         """The model of ``factor`` · W."""
         other = copy.copy(self)
         other.nodes = self.nodes
+        other.coarse = None if self.coarse is None else self.coarse.scaled(factor)
         other.terms = [(k, spread * math.sqrt(factor)) for k, spread in self.terms]
         other.seen, other.scale = self.seen * factor, self.scale * factor
         other._column = self._column * factor
@@ -306,6 +320,8 @@ class FieldStep(GradientStep):
         self._iterations = min(
             max(int(model.views / (VIEWS_A_TRANSFORM * transforms)), least), most
         )
+        if model.coarse is not None:
+            self._iterations = INNER_OF_VOLUMES
 
     def step(self, x: Tensor, data_gradient: Tensor) -> tuple[Tensor, int]:
         """The direction of descent, ``(batch, *shape)``, and how many iterations were allowed."""

@@ -25,6 +25,8 @@ whole field."""
 MODEL = 12
 """Arrays of one volume's size that the model of a whole field holds, whatever the batch: weights
 and spectra of its sectors, and what it was made of."""
+COARSE = 1
+"""Arrays of the data's size, at most, that it holds in a volume: weights of the coarser scan."""
 SINOGRAMS = 3
 """Arrays of the data's size besides the arguments: weighted data, projection, their product."""
 
@@ -55,7 +57,7 @@ def pwls_bytes(A: Projector, batch: int, dtype: torch.dtype, device: torch.devic
         if estimate is not None
         else 0
     )
-    model = dtype.itemsize * MODEL * volume
+    model = dtype.itemsize * (MODEL * volume + COARSE * data)
     return int(inside + model + item * (VOLUMES * volume + SINOGRAMS * data))
 
 

@@ -315,6 +315,7 @@ class Projector(Operator):
         self.geometry = geometry.base if isinstance(geometry, ParametricGeometry) else geometry
         self.grid = grid
         self.window = window
+        self.at_rest = motion is None
 
     def memory_estimate(
         self, batch: int = 1, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"

@@ -178,6 +178,8 @@ def flat_faces():
 def test_flat_faces_in_a_cone_beam_need_a_spectrum_of_their_own_slice(flat_faces, monkeypatch):
     A, y, w = flat_faces
     prior = QGGMRF(2.0, 4.0, relative=True)
+    # As of operators that have no coarser scan.
+    monkeypatch.setattr(field_model, "coarse_scan", lambda A, w: None)
     many = pwls(A, y, w, prior, mu_per_hu=HU, tolerance=0.1)
     monkeypatch.setattr(field_model, "FACTOR", math.inf)
     one = pwls(A, y, w, prior, mu_per_hu=HU, tolerance=0.1)
@@ -191,6 +193,7 @@ def test_slices_beyond_the_rows_do_not_slow_the_rest_down(monkeypatch):
     """A grid that is half again as high as what all views see, as many scans are reconstructed."""
     A = Projector(ConeBeam(full_turn(48), 100.0, 160.0, 40, 28, 1.2), VolumeGrid((30, 20, 20), 1.1))
     z, y, x = torch.meshgrid(*[torch.from_numpy(a) for a in A.grid.axes], indexing="ij")
+    monkeypatch.setattr(field_model, "coarse_scan", lambda A, w: None)  # it knows such slices
     y = A((0.02 * ((torch.hypot(y, x) < 8) & (z.abs() < 7))).float())
     w = 1e5 * torch.exp(-y)
     assert float((FieldModel(A, w).seen == 0).float().mean()) > 0.1
@@ -349,3 +352,50 @@ def test_a_whole_field_takes_few_pairs():
     ).report
     assert report["converged"]
     assert report["exact_pairs"] <= 25
+
+
+@pytest.mark.parametrize("shape", [(10, 24, 24), (10, 23, 26)], ids=["even", "odd"])
+def test_the_coarser_scan_knows_waves_that_change_slowly_in_the_plane(shape):
+    """Whatever the height, behind a dense body off the axis, in slices that some rows miss."""
+    A = Projector(ConeBeam(full_turn(61), 60.0, 100.0, 60, 14, 1.2), VolumeGrid(shape, 1.0))
+    _, y, x = torch.meshgrid(*[torch.from_numpy(a) for a in A.grid.axes], indexing="ij")
+    w = torch.exp(-0.4 * A(((x - 4) ** 2 + (2 * y) ** 2 < 40).float()))
+    model = FieldModel(A, w)
+    assert model.coarse is not None
+    noise = torch.randn(A.domain_shape, generator=torch.Generator().manual_seed(0))
+    fy, fx = torch.fft.fftfreq(shape[1])[:, None], torch.fft.rfftfreq(shape[2])
+    slow = torch.fft.irfft2(torch.fft.rfft2(noise) * (torch.hypot(fy, fx) < 0.11), s=shape[1:])
+    exact = A.T(w * A(slow))
+    for m, factor in ((model, 1.0), (model.scaled(2.0), 2.0)):
+        assert float((m.coarse.apply(slow) - factor * exact).norm() / exact.norm()) < 0.15 * factor
+
+
+def test_a_coarser_scan_only_where_it_saves_something(scan):
+    A, _, w, _ = scan
+    assert (FieldModel(A, w).coarse is not None) == (A.grid.ndim == 3)
+    moving = Projector(*SCANS["cone"], motion=np.zeros((40, 3)))
+    assert FieldModel(moving, torch.ones(moving.range_shape)).coarse is None
+    small = Projector(SCANS["cone"][0], VolumeGrid((5, 6, 12), 1.2))
+    assert FieldModel(small, torch.ones(small.range_shape)).coarse is None
+
+
+def test_plates_in_a_cone_beam_take_few_pairs():
+    """Faces across the axis, where no ray runs along them: twice the pairs and more by models of
+    places and directions alone."""
+    A = Projector(ConeBeam(full_turn(61), 80.0, 130.0, 54, 50, 1.6), VolumeGrid((32, 32, 32), 1.0))
+    z, y, x = torch.meshgrid(*[torch.from_numpy(a) for a in A.grid.axes], indexing="ij")
+    r = torch.hypot(x, y)
+    plates = 1.0 * ((r < 12) & (z.abs() < 12)) + 0.5 * ((r < 8) & (z.abs() < 10) & (z % 5 < 2))
+    lines = A((0.125 * plates).float())
+    w = 5e4 * torch.exp(-lines)
+    noise = torch.randn(A.range_shape, generator=torch.Generator().manual_seed(1))
+    y, prior = lines + noise / w.sqrt(), field_prior(1.0, 3)
+    found = pwls(A, y, w, prior, mu_per_hu=1.25e-4, tolerance=1.0)
+    without = FieldModel(A, w)
+    without.coarse = None
+    most = 2 * found.report["exact_pairs"]
+    before = pwls(
+        A, y, w, prior, mu_per_hu=1.25e-4, tolerance=1.0, gram=without, max_exact=most
+    ).report
+    assert found.report["converged"]
+    assert not before["converged"]
