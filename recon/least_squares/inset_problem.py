@@ -119,8 +119,8 @@ class InsetProblem:
             self.level = self._exterior.level(scan.line_integrals())
         except ValueError as error:
             raise ValueError(
-                "what lies around this inset is not known, and has to be found by FBP of the "
-                f"whole field: {error}; or take a grid that holds the whole field of view"
+                "the exterior of this inset is unknown and is estimated by FBP of the whole field: "
+                f"{error}; or take a grid that holds the whole field of view"
             ) from error
 
     def _place(self, motion: ArrayLike | None) -> None:

@@ -316,7 +316,10 @@ def check_information(information: Any, shape: tuple[int, ...]) -> None:
             "information must be positive semi-definite on every ray, packed as F11, F12, F22"
         )
     if not bool((f11 + f22 > 0).any()):
-        raise ValueError("all information is 0: no ray says anything about the inset")
+        raise ValueError(
+            "all information is 0: no reading through the inset has a weight; give information "
+            "above 0 where a ray was measured"
+        )
 
 
 @checked

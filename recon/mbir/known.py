@@ -51,7 +51,9 @@ class Drawn:
 
     def __post_init__(self) -> None:
         if (self.image is None) != bool(self.why):
-            raise ValueError("Drawn needs an image, or says why there is none")
+            raise ValueError(
+                "Drawn takes either an image or, in why, the reason that there is none"
+            )
 
 
 class Known(Protocol):

@@ -203,7 +203,8 @@ def follow(
     if not mass:
         raise ValueError(
             f"no vessel brighter than {threshold:.0f} HU at {np.round(start, 2).tolist()} mm (z, "
-            "y, x): the reader needs a lumen with contrast agent; give a point in it or beside it"
+            "y, x): a plaque is read beside a lumen with contrast agent; give a point in it or "
+            "beside it"
         )
     halves: list[list[Floats]] = []
     ends = []

@@ -57,7 +57,7 @@ def find_vessel(pilot: Floats, grid: VolumeGrid, point: Floats | None) -> Start:
     if not count or top - fat < _LEAST_STEP_HU:
         raise ValueError(
             f"nothing stands out of the surroundings ({fat:.0f} HU, brightest {top:.0f} HU): "
-            "the reader needs a vessel with contrast agent"
+            "a plaque is read beside a lumen with contrast agent"
         )
     if point is None:
         wanted = int(np.argmax(np.bincount(labels.ravel())[1:])) + 1
