@@ -80,8 +80,8 @@ VIEWS_A_TRANSFORM = 5.0
 """Views that are projected, both ways, in the time of a Fourier transform and its inverse (3 in a
 plane, 5.5 in a volume, on one core). As many iterations are made as take the time of one pair."""
 INNER_OF_VOLUMES = 8
-"""Iterations where the model has a coarser scan. Of thin plates 5 to 10 took 4.7 to 5.6 s and 35 to
-29 pairs, of a thorax 2.1 to 2.7 s and 16 to 13."""
+"""Iterations where the model has a coarser scan. Of thin plates 6 to 10 took 4.7 to 5.6 s and 35 to
+29 pairs, of a thorax 5 and 10 took 2.1 and 2.7 s, 16 and 13 pairs."""
 
 
 class FieldModel:
