@@ -1,14 +1,15 @@
 """AᵀWA of waves that change slowly in the plane, by the rays of a coarser scan.
 
-Of a cone beam's circular orbit no model by one spectrum for each place holds for them: which of
-them are seen hangs on the height, and on which side of the field they are (Tuy 1983, SIAM J. Appl.
-Math. 43:546); rows end within their response; an object of flat faces is made of them. Yet they
-need neither the columns nor the views of the scan: on voxels twice as wide, of all slices, with a
-quarter of the views, a pair of projections costs a sixth, and knows all of that.
+No model with one spectrum for each place describes them in a cone beam with a circular orbit: which
+of them the rays measure depends on the height and on the side of the field (Tuy 1983, SIAM J. Appl.
+Math. 43:546), their response extends beyond the last rows, and objects with flat faces consist of
+them. But they need neither all columns nor all views: on voxels twice as wide, with all slices and
+a quarter of the views, a pair of projections costs a sixth and includes all of that.
 """
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from typing import TYPE_CHECKING, Any
@@ -27,8 +28,9 @@ if TYPE_CHECKING:
 WIDER = 2
 """Voxels of the coarser scan in voxels of the grid, in the plane."""
 CUT = 0.16
-"""In-plane frequency, 1/voxel, at which half of a wave's energy is that of the coarser scan, all of
-it a quarter below, nothing a quarter above. The wider voxels hold 0.25."""
+"""In-plane frequency, 1/voxel, at which half of a wave's energy is taken from the coarser scan: all
+of it at frequencies a quarter lower, none a quarter higher. The wider voxels represent up to
+0.25."""
 EVERY = 4
 """Views of the scan for one of the coarser scan, at most."""
 DIRECTIONS = 0.75
@@ -100,8 +102,7 @@ class CoarseScan:
 
     def scaled(self, factor: float) -> CoarseScan:
         """That of ``factor`` · W."""
-        other = object.__new__(CoarseScan)
-        other.__dict__.update(self.__dict__)
+        other = copy.copy(self)
         other._weights = self._weights * factor
         return other
 
