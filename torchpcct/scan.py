@@ -579,14 +579,11 @@ class Scan:
         quantum = self.counts.new_ones(1) if self.quantum is None else self.quantum
         if self.noise_free or self.window is not None:
             mean = self.counts
-        elif self.electronic_noise:
-            mean = smoothed(self.counts, self.dead, rows, own=False)
         else:
-            mean = smoothed(self.counts, self.dead, rows)
+            mean = smoothed(self.counts, self.dead, rows, own=not self.electronic_noise)
             few = mean < _FOLLOWED * quantum
-            if bool(few.any()):
-                others = smoothed(self.counts, self.dead, rows, own=False)
-                mean = torch.where(few, others, mean)
+            if not self.electronic_noise and bool(few.any()):
+                mean = torch.where(few, smoothed(self.counts, self.dead, rows, own=False), mean)
         p = (self._at_window(self.air) / torch.maximum(mean, quantum / 2)).log_()
         if self.flux is not None:
             p += self._per_view(self.flux.log())

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 from recon.cli.parsing import (
     EXPOSURE,
     LENGTH,
-    MANY,
     PLACE,
+    REALISATIONS,
     Commands,
     Parser,
     add_execution,
@@ -81,10 +81,6 @@ methods: fbp:KERNEL, pwls, mbir, mbir:fidelity=1, mbir:weights=FILE, mbir:vessel
 
 """
 """What the help says of methods."""
-
-
-REALISATIONS = {"low": 8, "high": MANY}
-"""Limits of numbers of noise realisations."""
 
 
 def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:

@@ -45,6 +45,8 @@ MOST = 4096
 """More processes or threads than a machine has use for."""
 MANY = 10**6
 """More views, realisations or particles than anything here can hold."""
+REALISATIONS: Limits = {"low": 8, "high": MANY}
+"""Limits of numbers of noise realisations."""
 LENGTH: Limits = {"positive": True, "high": 1e12, "unit": "mm"}
 """Limits of lengths: scans of any unit of length pass, slips of a power of ten by far do not."""
 EXPOSURE: Limits = {"positive": True, "high": 1e6, "unit": "s"}
@@ -604,10 +606,10 @@ def find_modules_here() -> None:
         sys.path.append(here)
 
 
-def map_beside(volume: Path) -> Path:
-    """File of what a drawn vessel has changed in a volume, HU, beside it."""
+def difference_beside(volume: Path) -> Path:
+    """File beside a volume for its difference, in HU, from the one without a drawn vessel."""
     name = without_ending(volume)
-    return volume.with_name(f"{name}_drawn_minus_plain{volume.name[len(name) :]}")
+    return volume.with_name(f"{name}_vessel_difference{volume.name[len(name) :]}")
 
 
 def motion_beside(volume: Path) -> tuple[Path, Path]:

@@ -23,11 +23,11 @@ from recon.cli.parsing import (
     as_json,
     check_output,
     command,
+    difference_beside,
     executing,
     find_modules_here,
     is_picture,
     length_of,
-    map_beside,
     motion_beside,
     tell,
     without_ending,
@@ -77,8 +77,8 @@ def _size(text: str) -> str:
     return text
 
 
-_MAP = "drawn_minus_plain_hu"
-"""What a drawn vessel has changed, in a report of MBIR."""
+_DIFFERENCE = "vessel_difference_hu"
+"""Difference that a drawn vessel makes to the volume, in a report of MBIR."""
 _OPTIONS = {
     "kernel": "fbp",
     **dict.fromkeys(("fidelity", "vessel", "tissues", "point", "weights", "network"), "mbir"),
@@ -348,11 +348,11 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
     progress.close()
     placed = {"axis": scan.info["axis"]} if arguments.find_axis else {}
     volume = replace(volume, report={**volume.report, **placed, **_provenance(arguments)}).slices()
-    changed = volume.report.get(_MAP)
+    changed = volume.report.get(_DIFFERENCE)
     if changed is not None:
-        beside = map_beside(arguments.out)
+        beside = difference_beside(arguments.out)
         replace(volume, data=changed, report={}).save(beside)
-        volume = replace(volume, report={**volume.report, _MAP: beside.name})
+        volume = replace(volume, report={**volume.report, _DIFFERENCE: beside.name})
     if arguments.motion is not None:
         volume = _with_path(volume, *motion_beside(arguments.out))
     volume.save(arguments.out)

@@ -8,11 +8,10 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from recon.cli.evaluate import REALISATIONS
-
 # What loads torch or numba is imported by the commands: help and refusals come at once.
 from recon.cli.parsing import (
     MANY,
+    REALISATIONS,
     Commands,
     add_execution,
     add_options,

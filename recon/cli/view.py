@@ -18,9 +18,9 @@ from recon.cli.parsing import (
     check_ending,
     check_output,
     command,
+    difference_beside,
     is_picture,
     length_of,
-    map_beside,
     without_ending,
 )
 from torchpcct.files import atomic_write
@@ -35,11 +35,10 @@ if TYPE_CHECKING:
 _PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 """Endings of pictures."""
 _LEAST_HU = 20.0
-"""Range of values above which a volume without a unit is taken to be in HU."""
-_SCALE_OF_CHANGES = 0.0, 200.0
-"""Level and window in HU of what a drawn vessel has changed."""
-"""A volume whose values lie closer together is not in HU, whatever its file says (most do not
-say)."""
+"""Range of values above which a volume without a unit is taken to be in HU: one whose values lie
+closer together is not, whatever its file says (most do not say)."""
+_SCALE_OF_DIFFERENCES = 0.0, 200.0
+"""Level and window in HU of the difference that a drawn vessel makes."""
 
 
 def _is_volume(path: Path) -> bool:
@@ -174,14 +173,14 @@ def _view(arguments: argparse.Namespace, progress: ProgressBars) -> None:
             )
     from torchpcct.volume import Volume
 
-    changes = [map_beside(file) for file in files] if page else []
+    changes = [difference_beside(file) for file in files] if page else []
     files = [*files, *(path for path in changes if path.exists() and path not in files)]
     volumes = [Volume.load(file, fill=math.nan) for file in files]
     for file, volume in zip(files, volumes, strict=True):
         if not bool(volume.data.isfinite().any()):
             raise ValueError(f"{file} has no finite value: reconstruct it again")
     scales = [
-        _SCALE_OF_CHANGES
+        _SCALE_OF_DIFFERENCES
         if file in changes
         else _grey_scale(v.data, arguments.level, arguments.window)
         for file, v in zip(files, volumes, strict=True)

@@ -315,12 +315,12 @@ class FieldStep(GradientStep):
     def __init__(self, model: FieldModel, prior: BoundPrior, x: Tensor) -> None:
         super().__init__(model.nodes, prior, x, model.scale)
         self._model = model
-        transforms = len(model.terms) + len(model.nodes)
-        least, most = INNER
-        self._iterations = min(
-            max(int(model.views / (VIEWS_A_TRANSFORM * transforms)), least), most
-        )
-        if model.coarse is not None:
+        if model.coarse is None:
+            transforms = len(model.terms) + len(model.nodes)
+            least, most = INNER
+            affordable = int(model.views / (VIEWS_A_TRANSFORM * transforms))
+            self._iterations = min(max(affordable, least), most)
+        else:
             self._iterations = INNER_OF_VOLUMES
 
     def step(self, x: Tensor, data_gradient: Tensor) -> tuple[Tensor, int]:

@@ -86,7 +86,7 @@ class Inset:
             if network.known is not None and report[network.known.name]["drawn"]:
                 with torch.no_grad():
                     plain = network.with_known(None)(term.part([k]))[0]
-                report["drawn_minus_plain_hu"] = self._onto_grid(volume - plain)
+                report["vessel_difference_hu"] = self._onto_grid(volume - plain)
             if self.noise_map:
                 report["noise_sd_hu"] = self._onto_grid(network.noise_map(term.part([k])))
             found.append(Result(self._onto_grid(volume), report, warnings, tests))

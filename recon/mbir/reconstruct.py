@@ -64,7 +64,7 @@ def reconstruct_mbir(
         ``residual_p`` (:mod:`torchpcct.metrics.residual_test`: does the volume explain its data?),
         ``missing_body`` of an inset (:func:`recon.mbir.residual.missing_body`), ``warnings``; with
         something ``known``, under its name, whether it was drawn (``drawn``) or
-        ``why`` not, and where it was, ``drawn_minus_plain_hu``, the difference from the volume
+        ``why`` not, and where it was, ``vessel_difference_hu``, the difference from the volume
         without drawing, like the volume in HU.
 
     Raises:

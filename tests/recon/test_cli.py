@@ -407,12 +407,12 @@ def test_what_a_drawn_vessel_has_changed_is_written_and_shown(here, cli, clean, 
     cli("reconstruct mine.h5 --method mbir --vessel --out a.nii.gz")
     report = json.loads((here / "a.nii.gz.json").read_text(encoding="utf-8"))
     assert any("a vessel with smooth outlines was drawn" in text for text in report["warnings"])
-    assert report["drawn_minus_plain_hu"] == "a_drawn_minus_plain.nii.gz"
-    changed = Volume.load("a_drawn_minus_plain.nii.gz").data
+    assert report["vessel_difference_hu"] == "a_vessel_difference.nii.gz"
+    changed = Volume.load("a_vessel_difference.nii.gz").data
     cli("reconstruct mine.h5 --method mbir --out b.nii.gz")
     difference = Volume.load("a.nii.gz").data - Volume.load("b.nii.gz").data
     torch.testing.assert_close(changed, difference, rtol=0, atol=1e-3)
-    assert "a, b, a_drawn_minus_plain" in cli("view a.nii.gz b.nii.gz --html both.html")
+    assert "a, b, a_vessel_difference" in cli("view a.nii.gz b.nii.gz --html both.html")
 
 
 def test_a_vessel_is_read_where_the_scan_was_taken_or_said(here, cli):

@@ -213,10 +213,10 @@ def test_a_volume_says_what_was_drawn_and_what_that_changed(
     volume = reconstruct(scan, GRID, "mbir", vessel=True, **given)
     assert volume.report["vessel"] == {"drawn": True}
     assert any("may be missing" in text for text in volume.report["warnings"])
-    changed = volume.report["drawn_minus_plain_hu"]
+    changed = volume.report["vessel_difference_hu"]
     assert float(changed.abs().max()) > 1.0
     torch.testing.assert_close(volume.data - changed, plain.data, rtol=0, atol=1e-3)
     volume.save(tmp_path / "v.h5")
     again = Volume.load(tmp_path / "v.h5").report
-    assert torch.equal(again["drawn_minus_plain_hu"], changed)
+    assert torch.equal(again["vessel_difference_hu"], changed)
     assert again["vessel"] == {"drawn": True}
