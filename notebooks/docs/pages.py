@@ -167,7 +167,7 @@ def write_results(folder):
     for name, path in (
         ("card", f"{weights}/card.md"),
         ("training", f"{weights}/training.md"),
-        ("size", "train/size.md"),
+        ("experiments", "train/experiments.md"),
     ):
         _write(folder / f"{name}.txt", _linked((ROOT / path).read_text(encoding="utf-8"), ""))
 
@@ -204,7 +204,9 @@ def _linked(text, to):
     text = re.sub(r"\]\((\w+)/report\.md\)", rf"]({to}\1.md)", text)
     text = re.sub(r"\]\([^)]*tests/bench/(?:projectors|solvers)\.md\)", rf"]({to}speed.md)", text)
     text = text.replace("](docs/", "](")
-    return re.sub(r"\[([^\]]*)\]\([^)]*(?:causes|size|training|RESULTS)\.md\)", r"`\1`", text)
+    return re.sub(
+        r"\[([^\]]*)\]\([^)]*(?:card|causes|experiments|training|RESULTS)\.md\)", r"`\1`", text
+    )
 
 
 def _write(path, text):

@@ -33,7 +33,7 @@ class VesselPrior:
             where the scanner's zero lies.
         freedom: how far sections may move and leave a circle, relative to arteries at large of the
             same size. With 0.4 outlines are rounder: less error, and more contrast read where there
-            is no core (``train/size.md``).
+            is no core (``train/experiments.md``).
 
     Raises:
         ValueError: a value that is not finite, a standard deviation or freedom that is not
