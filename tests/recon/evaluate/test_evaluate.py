@@ -244,7 +244,7 @@ def test_the_report_names_who_shows_less_and_does_not_say_so(found):
             "value": share,
         }
         text = text_of(replace(found, records=[*found.records, said]))
-        assert ("without always saying so: shrunk@fbp:soft (slope" in text) is named
+        assert ("without always warning of it: shrunk@fbp:soft (slope" in text) is named
 
 
 def test_report_and_tidy_table(found, tmp_path):
