@@ -52,6 +52,19 @@ def same_device(**tensors: Tensor | None) -> torch.device:
     return first[1]
 
 
+def require_device(scan: torch.device, problem: torch.device) -> None:
+    """Refuse a scan that lies on another device than the problem that was made for it.
+
+    Raises:
+        ValueError: they differ.
+    """
+    if scan != problem:
+        raise ValueError(
+            f"the scan is on {scan}, the problem that was made for it on {problem}: "
+            f'move the scan, scan.to("{problem}"), or make the problem from the moved scan'
+        )
+
+
 def available_bytes(device: torch.device) -> int:
     """Memory that can still be allocated: of the device, of the container, or of the machine."""
     if device.type == "cuda":

@@ -14,8 +14,10 @@ Your denoiser on a lung nodule:
 
     from recon.evaluate import denoiser, evaluate, save
 
-    found = evaluate("nodule", ["mbir", denoiser(mine, "fbp:detail")], n=20,
-    folder="out/mine/pieces") save(found, "out/mine")
+    found = evaluate(
+        "nodule", ["mbir", denoiser(mine, "fbp:detail")], n=20, folder="out/mine/pieces"
+    )
+    save(found, "out/mine")
 """
 
 import importlib

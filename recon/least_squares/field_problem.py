@@ -21,6 +21,7 @@ from recon.analytic.fbp import fbp
 from recon.least_squares.pwls import PwlsOptions, pwls
 from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
 from recon.result import RESIDUAL_TEST, Result, tested
+from torchpcct.devices import require_device
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import Scan
@@ -60,28 +61,6 @@ def field_prior(voxel_mm: float, dimensions: int = 3) -> QGGMRF:
         dimensions: of the volume.
     """
     return DEFAULT_PRIOR.stretched(voxel_mm / REFERENCE_VOXEL_MM, dimensions)
-
-
-def require_device(scan: Scan, device: torch.device) -> None:
-    """Refuse a scan that lies on another device than the problem it is given to (ValueError)."""
-    if scan.device != device:
-        raise ValueError(
-            f"the scan is on {scan.device}, the problem that was made for it on {device}: "
-            f'move the scan, scan.to("{device}"), or make the problem from the moved scan'
-        )
-
-
-def is_whole_field(scan: Scan, grid: VolumeGrid) -> bool:
-    """Whether PWLS treats the grid as the whole field: always but for an inset of a cone beam."""
-    geometry = scan.geometry
-    if scan.exterior is not None:
-        return False
-    if not isinstance(geometry, ConeBeam):
-        return True  # an inset of a scan given view by view is solved on all that its rays cross
-    edges = zip(grid.extent[1:], grid.center[1:], strict=True)
-    return all(
-        extent / 2 - abs(center) >= geometry.fov_radius / math.sqrt(2) for extent, center in edges
-    )
 
 
 class FieldProblem:
@@ -150,7 +129,7 @@ class FieldProblem:
         """
         if scan.geometry != self.geometry:
             raise ValueError("this scan has another geometry than the one the problem was made for")
-        require_device(scan, self.device)
+        require_device(scan.device, self.device)
         y, w = scan.line_integrals(), scan.weights()
         n = len(self.geometry.shape)
         pairs = zip(y.reshape(-1, *y.shape[-n:]), w.reshape(-1, *w.shape[-n:]), strict=True)

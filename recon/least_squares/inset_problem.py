@@ -4,6 +4,7 @@ solve PWLS, give HU."""
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Unpack
@@ -18,13 +19,13 @@ from recon.data_term import Projected, Quadratic
 from recon.gram.gram import Gram
 from recon.least_squares.exterior import UnknownExterior, length_unit
 from recon.least_squares.field_model import FieldModel
-from recon.least_squares.field_problem import is_whole_field, require_device
 from recon.least_squares.memory import require_memory
 from recon.least_squares.pwls import MinimiseOptions, PwlsOptions, data_model, minimise
 from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
 from recon.result import RESIDUAL_TEST, Result, tested
 from torchpcct.detector_window import DetectorWindow, footprint
-from torchpcct.geometry import VolumeGrid
+from torchpcct.devices import require_device
+from torchpcct.geometry import ConeBeam, VolumeGrid
 from torchpcct.projector import Projector
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.scan_memory import once
@@ -37,6 +38,20 @@ if TYPE_CHECKING:
 
     from torchpcct.metrics.residual_test import ResidualTest
     from torchpcct.typing import JsonObject
+
+
+def is_whole_field(scan: Scan, grid: VolumeGrid) -> bool:
+    """Whether PWLS and MBIR treat the grid as the whole field: always but for an inset of a cone
+    beam."""
+    geometry = scan.geometry
+    if scan.exterior is not None:
+        return False
+    if not isinstance(geometry, ConeBeam):
+        return True  # an inset of a scan given view by view is solved on all that its rays cross
+    edges = zip(grid.extent[1:], grid.center[1:], strict=True)
+    return all(
+        extent / 2 - abs(center) >= geometry.fov_radius / math.sqrt(2) for extent, center in edges
+    )
 
 
 class InsetProblem:
@@ -196,7 +211,7 @@ class InsetProblem:
             raise ValueError(
                 "this scan has another geometry or window than the one the problem was made for"
             )
-        require_device(scan, self.device)
+        require_device(scan.device, self.device)
         if self._exterior is not None:
             return self._exterior.take_off(scan.line_integrals(), self.level)
         if self._background is None:

@@ -6,8 +6,8 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Unpack
 
-from recon.least_squares.field_problem import FieldProblem, is_whole_field
-from recon.least_squares.inset_problem import InsetProblem
+from recon.least_squares.field_problem import FieldProblem
+from recon.least_squares.inset_problem import InsetProblem, is_whole_field
 from recon.least_squares.pwls import PwlsOptions
 from recon.least_squares.qggmrf import QGGMRF
 from recon.result import Result

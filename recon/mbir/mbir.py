@@ -25,8 +25,8 @@ from recon.data_term import Quadratic
 from recon.mbir.known import Drawn, Known
 from recon.mbir.network import Network
 from recon.mbir.priors import Prior, name_of, network_of, prior_of
+from recon.mbir.recovery_note import contrast_note
 from recon.mbir.residual import missing_body
-from recon.mbir.shown import contrast_note
 from recon.mbir.unrolled import (
     DEFAULT_FIDELITY,
     Unrolled,
@@ -396,7 +396,7 @@ class Mbir:
 
     def notes(self, noise_scale_hu: float) -> list[str]:
         """What is to be known of a volume of this noise that speaks neither for nor against it
-        (:mod:`recon.mbir.shown`)."""
+        (:mod:`recon.mbir.recovery_note`)."""
         if not self.trained or self.known is not None:
             return []
         return contrast_note(self.weights_sha256, noise_scale_hu, self.fidelity)

@@ -6,8 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from recon.least_squares.field_problem import is_whole_field
-from recon.least_squares.inset_problem import InsetProblem
+from recon.least_squares.inset_problem import InsetProblem, is_whole_field
 from recon.mbir.field import Field
 from recon.mbir.inset import Inset
 from recon.mbir.known import Known

@@ -143,8 +143,9 @@ def _pairs(s: RecoverySettings) -> list[tuple[float, int]]:
     return [(e, seed) for e in s.exposures_s for seed in range(s.seed, s.seed + s.n)]
 
 
-def shown_by_mbir(report: JsonObject) -> str:
-    """The rows of MBIR with the weights that ship, as :mod:`recon.mbir.shown` reads them: JSON.
+def mbir_recovery(report: JsonObject) -> str:
+    """JSON of the rows of MBIR with the weights that ship, as :mod:`recon.mbir.recovery_note` reads
+    them.
 
     Args:
         report: of this study.

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from recon.evaluate.report import filled
-from recon.mbir.shown import RECOVERY
+from recon.mbir.recovery_note import RECOVERY
 from recon.study import registry, report
 
 if TYPE_CHECKING:
@@ -44,14 +44,14 @@ PASSING = (
 Tables are Markdown of records that stand beside them, and hold seconds."""
 
 
-SHOWN = f"recon/mbir/weights/{RECOVERY}"
-"""What MBIR says of small and faint bodies, from the study "recovery"."""
+_RECOVERY_FILE = f"recon/mbir/weights/{RECOVERY}"
+"""Contrast recovery by MBIR of small and faint bodies, from the study "recovery"."""
 
 
 def render(root: Path) -> dict[str, str]:
     """File, relative to the repository ``root``, → its text with the committed figures: RESULTS.md,
-    README.md, the ``report.md`` of every study that is committed, and what MBIR says of small and
-    faint bodies (:mod:`recon.mbir.shown`).
+    README.md, the ``report.md`` of every study that is committed, and how much of small and faint
+    bodies MBIR shows (:mod:`recon.mbir.recovery_note`).
 
     Raises:
         ValueError: a report, key or figure is missing, a format does not fit, a mark is missing.
@@ -77,11 +77,11 @@ def render(root: Path) -> dict[str, str]:
         )
     block = text[text.index(first) : text.index(last)]
     studies = [study for study in map(registry.folder, registry.STUDIES) if study in found]
-    from recon.study.recovery import shown_by_mbir  # loads numba
+    from recon.study.recovery import mbir_recovery  # loads numba
 
-    shown_figures = {SHOWN: shown_by_mbir(found["recovery"])} if "recovery" in found else {}
+    recovery = {_RECOVERY_FILE: mbir_recovery(found["recovery"])} if "recovery" in found else {}
     return {
-        **shown_figures,
+        **recovery,
         **{
             f"notebooks/{study}/report.md": report.render(study, found[study]) + "\n"
             for study in studies

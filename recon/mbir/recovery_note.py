@@ -1,7 +1,8 @@
-"""What the network that ships shows of small and faint bodies: a note for every volume.
+"""How much of the contrast of small and faint bodies the network that ships recovers: a note for
+every volume.
 
-A prior takes for noise what is small or faint, and the volume does not look like it. How much of
-the contrast of balls is shown has been measured on the paper's plaque (``torchpcct study
+A prior takes small and faint bodies for noise, and the volume does not show that it did. How much
+of the contrast of balls is recovered has been measured on the paper's plaque (``torchpcct study
 recovery``); the figures lie beside the weights, and hold for these weights alone. In a scan at hand
 :func:`recon.evaluate.contrast_recovery` measures it.
 """
@@ -17,17 +18,17 @@ from typing import TypedDict
 __all__ = ["RECOVERY", "contrast_note"]
 
 RECOVERY = "recovery.json"
-"""File beside the weights: ``weights_sha256`` and ``rows`` (:class:`Shown`)."""
+"""File beside the weights: ``weights_sha256`` and ``rows`` (:class:`MeasuredRecovery`)."""
 _FARTHEST = 1.5
-"""The noise scale of the figures is that of the scan within this factor, or nothing is said."""
+"""The noise scale of the figures is that of the scan within this factor, or there is no note."""
 _LESS = 0.9
-"""Balls are named of which less than this part of what soft FBP shows is shown."""
+"""Balls are named whose contrast recovery is below this fraction of that of soft FBP."""
 _NAMED = 2
-"""So many sizes, the smallest."""
+"""Number of sizes that are named, the smallest."""
 
 
-class Shown(TypedDict):
-    """A row of the file: a ball at one noise scale and one fidelity, and what is shown of it."""
+class MeasuredRecovery(TypedDict):
+    """A row of the file: contrast recovery of a ball at one noise scale and one fidelity."""
 
     noise_scale_hu: float
     fidelity: float
@@ -38,7 +39,7 @@ class Shown(TypedDict):
 
 
 @cache
-def _measured() -> tuple[str, tuple[Shown, ...]]:
+def _measured() -> tuple[str, tuple[MeasuredRecovery, ...]]:
     """Digest of the weights, and the rows."""
     file = resources.files("recon") / "mbir" / "weights" / RECOVERY
     if not file.is_file():
@@ -60,7 +61,7 @@ def contrast_note(weights_sha256: str, noise_scale_hu: float, fidelity: float) -
     if digest != weights_sha256 or not rows:
         return []
 
-    def far(row: Shown) -> float:
+    def far(row: MeasuredRecovery) -> float:
         return abs(math.log(row["noise_scale_hu"] / noise_scale_hu))
 
     alike = [r for r in rows if abs(r["fidelity"] - fidelity) < 0.01]

@@ -5,9 +5,9 @@ import json
 
 import pytest
 
-from recon.mbir import shown
+from recon.mbir import recovery_note
 from recon.mbir.mbir import Mbir
-from recon.study.recovery import shown_by_mbir
+from recon.study.recovery import mbir_recovery
 
 ROWS = (
     {"noise_scale_hu": 40.0, "diameter_mm": 1.0, "recovered": 0.25, "soft_fbp": 0.69},
@@ -21,11 +21,11 @@ ROWS = (
 @pytest.fixture(autouse=True)
 def measured(monkeypatch):
     rows = tuple({"fidelity": 0.5, "contrast_hu": 100.0, **row} for row in ROWS)
-    monkeypatch.setattr(shown, "_measured", lambda: ("abc", rows))
+    monkeypatch.setattr(recovery_note, "_measured", lambda: ("abc", rows))
 
 
 def test_the_smallest_balls_that_lose_contrast_are_named():
-    (text,) = shown.contrast_note("abc", 35.0, 0.5)
+    (text,) = recovery_note.contrast_note("abc", 35.0, 0.5)
     first = text.index("25 % of a ball of 1 mm and +100 HU (soft FBP 69 %)")
     assert first < text.index("10 % of a ball of 2 mm")
     assert "0.5 mm" not in text  # hardly less than by soft FBP
@@ -39,8 +39,8 @@ def test_of_a_size_the_ball_that_loses_most_is_named(monkeypatch):
         {**row, "contrast_hu": -100.0, "recovered": 0.2},
         {**row, "contrast_hu": 100.0, "recovered": 0.3},
     )
-    monkeypatch.setattr(shown, "_measured", lambda: ("abc", rows))
-    (text,) = shown.contrast_note("abc", 40.0, 0.5)
+    monkeypatch.setattr(recovery_note, "_measured", lambda: ("abc", rows))
+    (text,) = recovery_note.contrast_note("abc", 40.0, 0.5)
     assert "20 % of a ball of 1 mm and -100 HU" in text
     assert text.count("a ball") == 1
 
@@ -56,7 +56,7 @@ def test_of_a_size_the_ball_that_loses_most_is_named(monkeypatch):
     ],
 )
 def test_nothing_is_said_of_what_was_not_measured(given):
-    assert shown.contrast_note(*given) == []
+    assert recovery_note.contrast_note(*given) == []
 
 
 def test_other_priors_have_no_note():
@@ -75,7 +75,7 @@ def test_the_study_gives_the_file():
             {**row, "exposure_s": 0.35, "method": "mbir:fidelity=1", "recovered": 0.5},
         ],
     }
-    found = json.loads(shown_by_mbir(report))
+    found = json.loads(mbir_recovery(report))
     assert found["weights_sha256"] == "abc"
     assert [
         (r["noise_scale_hu"], r["fidelity"], r["recovered"], r["soft_fbp"]) for r in found["rows"]
