@@ -55,12 +55,13 @@ class MethodOptions(PwlsOptions, total=False):
     another method is a ``TypeError``.
 
     Attributes:
-        vessel: of MBIR: draw a contrast-enhanced vessel of the inset with smooth outlines, and let
-            the network reconstruct what they leave (:mod:`recon.vessel.known`); three times as
-            long. Sharper on vessels that are so, wrong on disease that has other outlines:
-            ``warnings`` say whether it was drawn, and the report holds what it changed. Where no
-            vessel is found, or its outlines do not explain the data, the volume is the one without.
-        tissues: draw the tissues' values and a core as well, at full contrast where the data prove
+        vessel: of MBIR: fit a model of the inset's contrast-enhanced vessel, with smooth
+            outlines, and let the network reconstruct the residual (:mod:`recon.vessel.known`);
+            three times as long. Sharper on vessels that are so, wrong on disease that has other
+            outlines: ``warnings`` say whether it was used, the report holds what it changed. Where
+            no vessel is found, or its outlines do not explain the data, the volume is the one
+            without.
+        tissues: fit the tissues' values and a core as well, at full contrast where the data prove
             it; a few seconds a volume longer. Where they do not explain the data, the volume is the
             one without, with a warning. The report holds under ``tissues`` what was read of them.
         point: ``(z, y, x)`` mm where a reader sees the plaque, for ``tissues``; None: in the
@@ -138,7 +139,7 @@ def reconstruct(
             :func:`recon.least_squares.reconstruct.reconstruct_pwls`; a volume that did not converge
             carries ``warnings`` in its report) or ``"mbir"`` (unrolled steps with the learned prior
             that ships with the package, of an inset or a whole field; options of
-            :func:`recon.mbir.reconstruct.reconstruct_mbir`, and what may be drawn of a vessel, see
+            :func:`recon.mbir.reconstruct.reconstruct_mbir`, and models of a vessel, see
             :class:`MethodOptions`; what the training has not seen is named in ``warnings``).
             Options may follow, as an evaluation has them
             (:mod:`recon.evaluate.methods`): ``"fbp:soft"``,
@@ -148,7 +149,7 @@ def reconstruct(
             where the scan lies (:meth:`torchpcct.Scan.to`). On another device than the CPU the
             report says under ``device`` which one, and under ``on_cpu`` what was computed on the
             CPU all the same: tests and repair of the readings, tests of what a volume leaves of
-            them, the fit of an inset's FFT model, and what is drawn of a vessel. All else runs on
+            them, the fit of an inset's FFT model, and the vessel model. All else runs on
             the device, with Triton's kernels.
         motion: of an inset whose exterior is known (``acquire(…, region=)``), which stands still:
             its displacement in every view, ``(views, 3)`` z, y, x mm; ``"estimate"``: from the
@@ -336,7 +337,7 @@ def _on_cpu(method: str, scan: Scan, report: JsonObject) -> list[str]:
         if scan.geometry.has_rows and "work_grid" not in report:
             found.append("fit of the FFT model of an inset")
         if "vessel" in report or "tissues" in report:
-            found.append("what is drawn of the vessel")
+            found.append("the vessel model")
         if not scan.noise_free:
             found.append("test of what the volume leaves of the readings")
     return found
@@ -422,7 +423,7 @@ def _mbir(
     vessel_prior: VesselPrior | None = None,
     **options: Any,
 ) -> Iterator[list[Result]]:
-    """MBIR, with the applications that draw what is known of the object: a vessel's outlines or
+    """MBIR, with the applications that model what is known of the object: a vessel's outlines or
     tissues."""
     if vessel or tissues or point is not None or vessel_prior is not None:
         # Loaded where somebody asks for it alone.

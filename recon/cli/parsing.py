@@ -607,7 +607,7 @@ def find_modules_here() -> None:
 
 
 def difference_beside(volume: Path) -> Path:
-    """File beside a volume for its difference, in HU, from the one without a drawn vessel."""
+    """File beside a volume for its difference, in HU, from the one without a vessel model."""
     name = without_ending(volume)
     return volume.with_name(f"{name}_vessel_difference{volume.name[len(name) :]}")
 

@@ -78,7 +78,7 @@ def _size(text: str) -> str:
 
 
 _DIFFERENCE = "vessel_difference_hu"
-"""Difference that a drawn vessel makes to the volume, in a report of MBIR."""
+"""Difference that a vessel model makes to the volume, in a report of MBIR."""
 _OPTIONS = {
     "kernel": "fbp",
     **dict.fromkeys(("fidelity", "vessel", "tissues", "point", "weights", "network"), "mbir"),

@@ -38,7 +38,7 @@ _LEAST_HU = 20.0
 """Range of values above which a volume without a unit is taken to be in HU: one whose values lie
 closer together is not, whatever its file says (most do not say)."""
 _SCALE_OF_DIFFERENCES = 0.0, 200.0
-"""Level and window in HU of the difference that a drawn vessel makes."""
+"""Level and window in HU of the difference that a vessel model makes."""
 
 
 def _is_volume(path: Path) -> bool:

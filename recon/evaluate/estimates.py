@@ -348,7 +348,7 @@ def records_of(
             factor("contrast at slope 1", roi, other.log_relative(k), own.log_relative(k))
     lesion = rois.index("lesion")
     best = math.log(ground_truth.bound_hu**2 / exposure_s) - _log_of_square(true[lesion])
-    factor("limit of the data", "lesion", other.log_relative(lesion), best)
+    factor("Cramér–Rao bound", "lesion", other.log_relative(lesion), best)
     add("CNR", rois[0], own.cnr(0))
     if _value(own.cnr(0)) > 0 and _value(other.cnr(0)) > 0:
         factor("CNR", rois[0], _log_square(own.cnr(0)), _log_square(other.cnr(0)))
@@ -360,7 +360,7 @@ def records_of(
             factor("d'", observer, _log_square(d), _log_square(e))
     add("seconds", "a volume", readings.seconds, "s")
     for figure, shares in (
-        ("share drawn", readings.drawn),
+        ("share with a vessel model", readings.vessel_used),
         ("share with a warning", readings.warned),
     ):
         for where, share in zip(("with the signal", "without the signal"), shares, strict=True):

@@ -79,8 +79,8 @@ class RoiReadings:
             the reference's ROI means serve.
         first: first volume with the signal, float16, and that of noise-free data.
         seconds: of a volume.
-        drawn, warned: shares of volumes with and without the signal in which MBIR drew a vessel, or
-            warned of something; NaN: the method does not say.
+        vessel_used, warned: shares of volumes with and without the signal for which MBIR used a
+            vessel model, or warned of something; NaN: the method does not say.
     """
 
     rois: Floats
@@ -97,7 +97,7 @@ class RoiReadings:
     first: NDArray[np.float16]
     first_clean: NDArray[np.float16]
     seconds: float
-    drawn: Floats
+    vessel_used: Floats
     warned: Floats
 
     @property
@@ -346,7 +346,7 @@ class Measurement:
             first=pieces[0]["first"],
             first_clean=clean["first"],
             seconds=float(np.mean([p["seconds"] for p in pieces])),
-            drawn=joined["drawn"].mean(0),
+            vessel_used=joined["vessel_used"].mean(0),
             warned=joined["warned"].mean(0),
         )
 
@@ -365,7 +365,7 @@ def _measure_pairs(
         name: []
         for name in (
             "rois",
-            "drawn",
+            "vessel_used",
             "warned",
             "square",
             "square_beside",
@@ -387,7 +387,7 @@ def _measure_pairs(
             if fbp is not None and len(seconds) == 1:
                 check_volume(volumes[0], method, reader, fbp)
         lists["rois"].append([reader.pair(v) for v in volumes])
-        for name in ("drawn", "warned"):
+        for name in ("vessel_used", "warned"):
             answers = [getattr(realisation, name, None) for realisation in pair]
             lists[name].append([math.nan if a is None else float(a) for a in answers])
         if adjoints is not None:

@@ -187,8 +187,8 @@ class Simulated:
 
     Attributes:
         exposure_s: of the scan; grid: of the volume; label: for files.
-        drawn, warned: whether MBIR has drawn a vessel, and has warned of something; None: it was
-            not asked.
+        vessel_used, warned: whether MBIR has used a vessel model, and has warned of something;
+            None: it was not asked.
     """
 
     def __init__(
@@ -202,7 +202,7 @@ class Simulated:
     ) -> None:
         self._realisations, self._scan, self._with_signal = realisations, scan, with_signal
         self.exposure_s, self.k, self.present = exposure_s, k, present
-        self.drawn: bool | None = None
+        self.vessel_used: bool | None = None
         self.warned: bool | None = None
 
     @property
@@ -273,8 +273,8 @@ class Simulated:
         """HU ``(z, y, x)``, as :func:`recon.reconstruct` gives it."""
         with torch.no_grad():
             (found,) = network.solve(self.term)
-        self.drawn, self.warned = (
-            found.report.get("vessel", {}).get("drawn"),
+        self.vessel_used, self.warned = (
+            found.report.get("vessel", {}).get("used"),
             bool(found.warnings or found.report["missing_body"]),
         )
         return found.volume

@@ -83,7 +83,7 @@ class Inset:
             if not scan.noise_free:
                 report["notes"] = network.notes(report["noise_scale_hu"][0])
                 tests = tested(RESIDUAL_TEST, warnings, problem.residual_test, scan, volume, y)
-            if network.known is not None and report[network.known.name]["drawn"]:
+            if network.known is not None and report[network.known.name]["used"]:
                 with torch.no_grad():
                     plain = network.with_known(None)(term.part([k]))[0]
                 report["vessel_difference_hu"] = self._onto_grid(volume - plain)

@@ -1,13 +1,13 @@
 """What is known of the object before MBIR reconstructs the rest: a plug-in, see
 :meth:`recon.mbir.mbir.Mbir.with_known`.
 
-With T an image of what is known, drawn from the scan's own data,
+With T an image of what is known, fitted to the scan's own data,
 
     u = T + MBIR(b − H T),
 
 so whatever T lacks comes from the data as ever, beside an edge that is no longer there to bleed
-into it. Nothing in :mod:`recon.mbir` says what T shows: :mod:`recon.vessel.known` draws a
-contrast-enhanced vessel.
+into it. Nothing in :mod:`recon.mbir` says what T shows: :mod:`recon.vessel.known` models
+a contrast-enhanced vessel.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from recon.data_term import Quadratic
 if TYPE_CHECKING:
     from torchpcct.typing import JsonObject
 
-__all__ = ["Drawn", "Known"]
+__all__ = ["Known", "KnownImage"]
 
 
 def _no_objection(volume: Tensor) -> str:
@@ -31,16 +31,16 @@ def _no_objection(volume: Tensor) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
-    """What is drawn of one scan.
+class KnownImage:
+    """What is known of the object of one scan.
 
     Attributes:
         image: T, HU ``(z, y, x)``, differentiable in the data as far as it says so; None: nothing.
-        why: nothing is drawn, for the report and its warning; empty with an image.
+        why: there is no image, for the report and its warning; empty with an image.
         report: added to the volume's report.
         warnings: added to those of the volume's report.
         objection: what speaks against T, given the reconstruction around it, HU ``(z, y, x)``;
-            empty: nothing. A T that is objected to is not drawn.
+            empty: nothing. A T that is objected to is not used.
     """
 
     image: Tensor | None
@@ -52,17 +52,17 @@ class Drawn:
     def __post_init__(self) -> None:
         if (self.image is None) != bool(self.why):
             raise ValueError(
-                "Drawn takes either an image or, in why, the reason that there is none"
+                "KnownImage takes either an image or, in why, the reason that there is none"
             )
 
 
 class Known(Protocol):
-    """A plug-in: draws what is known of the object into each scan.
+    """A plug-in: an image of what is known of the object, fitted to each scan.
 
     Attributes:
-        name: what it draws, such as ``vessel``; in reports the key under which ``drawn`` and
+        name: what it models, such as ``vessel``; in reports the key under which ``used`` and
             ``why`` stand.
-        caution: the warning of a volume in which something was drawn.
+        caution: the warning of a volume for which the model was used.
     """
 
     @property
@@ -75,8 +75,8 @@ class Known(Protocol):
         """See the class."""
         ...
 
-    def drawn(self, term: Quadratic, fidelity: float) -> Drawn:
-        """What is drawn of one scan.
+    def image_of(self, term: Quadratic, fidelity: float) -> KnownImage:
+        """The image of one scan.
 
         Args:
             term: of the scan, in mm⁻¹, a batch of one; its operator is a

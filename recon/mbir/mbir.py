@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from recon.data_term import Quadratic
-from recon.mbir.known import Drawn, Known
+from recon.mbir.known import Known, KnownImage
 from recon.mbir.network import Network
 from recon.mbir.priors import Prior, name_of, network_of, prior_of
 from recon.mbir.recovery_note import contrast_note
@@ -203,7 +203,7 @@ class Mbir:
         """Volumes in HU with their reports (:meth:`results`), the units of ``term`` as above, and
         ``missing_body``: the ball that the data hold and the volume does not, by diameter_mm,
         contrast_hu, deviations and voxel, or None (:func:`recon.mbir.residual.missing_body`). With
-        something known, reports and warnings say what was drawn, or why not."""
+        something known, reports and warnings say that it was used, or why not."""
         normal = self.normal(term)
         u, notes = self._solved(term, normal)
         with torch.no_grad():
@@ -269,11 +269,10 @@ class Mbir:
     def _around(
         self, known: Known, term: Quadratic, normal: Quadratic
     ) -> tuple[Tensor, list[_Note]]:
-        """Around what is known; where nothing is drawn, or what is drawn is objected to, without
-        it."""
+        """Around what is known; without it where there is no image of it, or an objection."""
         scans = range(len(term.b))
         # What is known is fitted on the CPU.
-        found = [known.drawn(term.part([k]).to("cpu"), self.fidelity) for k in scans]
+        found = [known.image_of(term.part([k]).to("cpu"), self.fidelity) for k in scans]
         why = [one.why for one in found]
         images = {k: one.image for k, one in enumerate(found) if one.image is not None}
         volumes: dict[int, Tensor] = {}
@@ -471,10 +470,10 @@ class _Note(NamedTuple):
     warnings: list[str]
 
 
-def _note(known: Known, found: Drawn, why: str) -> _Note:
-    """Warnings of a scan in which something known was to be drawn."""
-    entry = {"drawn": False, "why": why} if why else {"drawn": True}
-    text = f"no {known.name} was drawn: {why}" if why else known.caution
+def _note(known: Known, found: KnownImage, why: str) -> _Note:
+    """Report and warnings of a scan for which a model of something known was asked for."""
+    entry = {"used": False, "why": why} if why else {"used": True}
+    text = f"no {known.name} model was used: {why}" if why else known.caution
     return _Note({**found.report, known.name: entry}, [*found.warnings, text])
 
 

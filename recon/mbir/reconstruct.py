@@ -51,7 +51,7 @@ def reconstruct_mbir(
             more noise), see :mod:`recon.mbir.unrolled`; None: that of ``network``, which is 0.5
             unless it was loaded with another.
         noise_map: add an estimate of each voxel's standard deviation, ``report["noise_sd_hu"]``.
-        known: what is known of the object and drawn before, such as a vessel
+        known: what is known of the object before, such as a vessel
             (:mod:`recon.mbir.known`), of small insets; None: nothing, or what ``network`` knows.
 
     Yields:
@@ -62,9 +62,9 @@ def reconstruct_mbir(
         the grid that is worked on), ``weights_sha256`` or the name of the ``prior``, of noisy scans
         ``residual_p`` (:mod:`torchpcct.metrics.residual_test`: does the volume explain its data?),
         ``missing_body`` of an inset (:func:`recon.mbir.residual.missing_body`), ``warnings``; with
-        something ``known``, under its name, whether it was drawn (``drawn``) or
+        something ``known``, under its name, whether its model was used (``used``) or
         ``why`` not, and where it was, ``vessel_difference_hu``, the difference from the volume
-        without drawing, like the volume in HU.
+        without it, like the volume in HU.
 
     Raises:
         ValueError, TypeError: see :class:`recon.least_squares.inset_problem.InsetProblem`; an inset
@@ -83,7 +83,7 @@ def reconstruct_mbir(
         network = network.with_known(known)
     if problem is None and is_whole_field(scans[0], grid):
         asked = ["noise_map"] * noise_map
-        asked += [f"a drawn {network.known.name}"] if network.known is not None else []
+        asked += [f"a {network.known.name} model"] if network.known is not None else []
         if asked:
             raise ValueError(
                 f"{asked[0]} needs the FFT model of a small inset: ask for a smaller grid"

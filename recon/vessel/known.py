@@ -1,34 +1,35 @@
-"""What MBIR may know of a vessel: its outlines, or its tissues, drawn before the network
+"""What MBIR may know of a vessel: its outlines, or its tissues, modelled before the network
 reconstructs the rest (:mod:`recon.mbir.known`).
 
 **Outlines** (:class:`KnownVessel`). A network that sees some millimetres about a voxel has to find
 every piece of a vessel's outline by itself, in the noise of that place. A contrast-enhanced vessel
 has two smooth outlines over its whole length (lumen and outer wall, a dozen numbers a centimetre),
-so the data determine them far better (:mod:`recon.vessel.model`). In the fibrous layer of the drawn
-vessel stands the best linear estimate of its contents (:mod:`recon.vessel.layer`). Where no vessel
-is found, or a drawn one does not explain the data within 1 mm of its wall, but for its fibrous
-layer, nothing is drawn.
+so the data determine them far better (:mod:`recon.vessel.model`). In the fibrous layer of the
+modelled vessel stands the best linear estimate of its contents (:mod:`recon.vessel.layer`). Where
+no vessel is found, or the model does not explain the data within 1 mm of its wall, but for its
+fibrous layer, no model is used.
 
-A drawing shows smooth outlines and nothing else. On disease that has others (a flap, an ulcer, a
+A vessel model has smooth outlines and nothing else. On disease that has others (a flap, an ulcer, a
 thrombus at the wall, inflamed fat, a stent) it may be wrong and explain the data all the same. So
-it is drawn only where somebody asks for it, the volume's warnings say so, and the reconstruction
+it is used only where somebody asks for it, the volume's warnings say so, and the reconstruction
 without it (:meth:`recon.mbir.mbir.Mbir.with_known` of None) is there to be compared with.
 
 **Tissues** (:class:`KnownTissues`). What a tissue is made of is pooled over the tissue, not over a
 neighbourhood: beside the outlines the tissue values and a plaque's core are fitted to the data
 (:mod:`recon.vessel.reading`), with a core and without. With P the probability that the core is
-there the drawn image is
+there the model's image is
 
     T = P · (with the core) + (1 − P) · (as around outlines alone)
 
 So a proven core has its full contrast. The less a core is proven, the more the linear estimate
 stands in the layer; in between the contrast is shrunk, as a mean over two explanations is.
 
-Other weights than P trade one thing for another, as 48 draws at 0.35 and 2.0 s have shown. A core
-that is always drawn has the least error where there is none, and up to 45 % more noise of the
-contrast. P² has up to 11 % less noise of the contrast than P, but 16 to 29 % more error where there
-is no core. P has the least error inside the vessel, or nearly. Where the tissues do not explain the
-data (their residual exceeds what noise leaves), the outlines alone are tried.
+Other weights than P trade one thing for another, as 48 noise realisations at 0.35 and 2.0 s have
+shown. A core that is always modelled has the least error where there is none, and up to 45 % more
+noise of the contrast. P² has up to 11 % less noise of the contrast than P, but 16 to 29 % more
+error where there is no core. P has the least error inside the vessel, or nearly. Where
+the tissues do not explain the data (their residual exceeds what noise leaves), the outlines alone
+are tried.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from recon.data_term import Quadratic
-from recon.mbir.known import Drawn, Known
+from recon.mbir.known import Known, KnownImage
 from recon.mbir.unrolled import DEFAULT_FIDELITY
 from recon.vessel.data import grid_of, in_hu, pilot
 from recon.vessel.layer import SD_HU, LayerEstimate
@@ -60,8 +61,8 @@ _SHIFT_HU = 200.0
 """HU; where the zero lies does not matter to an image: 150 HU added to everything change it by 1 HU
 rms instead of 9."""
 _APART_MM = 1.0
-"""From the wall: muscle, veins and other vessels further away speak against no drawing; what is
-nearer may be a part of the vessel that the drawing lacks."""
+"""From the wall: muscle, veins and other vessels further away speak against no model; what is
+nearer may be a part of the vessel that the model lacks."""
 _TISSUE_HU = 120.0, 350.0
 """Wall and fibrous tissue above fat. Ten fits of sound vessels had 148 to 302 HU of fibrous tissue;
 inflamed fat about a healthy vessel was fitted with 29 to 75, a flap with 457 and 473, a stent with
@@ -80,8 +81,8 @@ def known_vessel(
     """What MBIR is to know of a vessel, by the options of :func:`recon.api.reconstruct`.
 
     Args:
-        vessel: draw its outlines.
-        tissues: draw its tissues as well.
+        vessel: model its outlines.
+        tissues: model its tissues as well.
         point: ``(z, y, x)`` mm where a reader sees the plaque, for ``tissues``; None: in the
             largest vessel.
         vessel_prior: what is believed of the vessel's tissues before the data; None: a coronary
@@ -120,19 +121,19 @@ class KnownVessel:
     Args:
         vessel_prior: what is believed of the vessel before the data; None: a coronary artery, on a
             scanner whose zero is not known (``shift`` of 200 HU), and one whose tissues are none of
-            a coronary artery is not drawn.
+            a coronary artery is not modelled.
     """
 
     vessel_prior: VesselPrior | None = None
     name = "vessel"
     caution = (
-        "a vessel with smooth outlines was drawn, and disease that has others (flap, ulcer, "
+        "a vessel model with smooth outlines was used, and disease that has others (flap, ulcer, "
         "thrombus, inflamed fat, stent, calcifications below 1 mm) may be missing: compare with "
-        "the reconstruction that draws nothing"
+        "the reconstruction without it"
     )
 
-    def drawn(self, term: Quadratic, fidelity: float) -> Drawn:
-        """See :meth:`recon.mbir.known.Known.drawn`."""
+    def image_of(self, term: Quadratic, fidelity: float) -> KnownImage:
+        """See :meth:`recon.mbir.known.Known.image_of`."""
         b, data = term.b[0], in_hu(term)
         try:
             # Many small matrices: BLAS threads would wait for each other.
@@ -143,16 +144,16 @@ class KnownVessel:
                     vessel.fit(vessel.first_guess(), expected=True), layer_sd_hu(fidelity)
                 )
         except (ValueError, np.linalg.LinAlgError) as error:
-            return Drawn(None, str(error))
+            return KnownImage(None, str(error))
         fit = estimate.fit
         strange = None if self.vessel_prior is not None else _strange_tissue(fit)
         if strange:
-            return Drawn(None, strange)
+            return KnownImage(None, strange)
         credited = np.maximum(vessel.on_grid(estimate.share), _apart(vessel, fit))
         outlines, others = (torch.from_numpy(v).to(b) for v in (fit.image, credited))
 
         def objection(volume: Tensor) -> str:
-            # The drawing knows fibrous tissue alone in the layer, and fat alone around: there the
+            # The model knows fibrous tissue alone in the layer, and fat alone around: there the
             # network is believed.
             there = data.apply((others * (volume - outlines))[None])[0]
             highest = float(np.abs(scores_of(vessel, fit, there)).max())
@@ -160,7 +161,7 @@ class KnownVessel:
                 return ""
             return f"its outlines leave {highest:.0f} standard deviations of the noise unexplained"
 
-        return Drawn(_LinearImage.apply(b, estimate, term.mu_per_hu), objection=objection)
+        return KnownImage(_LinearImage.apply(b, estimate, term.mu_per_hu), objection=objection)
 
 
 @dataclass(frozen=True)
@@ -182,10 +183,10 @@ class KnownTissues(KnownVessel):
         if self.point is not None:
             object.__setattr__(self, "point", numbers("point", self.point, 3, unit="mm"))
 
-    def drawn(self, term: Quadratic, fidelity: float) -> Drawn:
-        """See :meth:`recon.mbir.known.Known.drawn`; the report holds ``tissues``: what was read, or
-        why not."""
-        outlines = super().drawn
+    def image_of(self, term: Quadratic, fidelity: float) -> KnownImage:
+        """See :meth:`recon.mbir.known.Known.image_of`; the report holds ``tissues``: what was
+        read, or why not."""
+        outlines = super().image_of
         try:
             reading = read_plaque(term, self.point, vessel_prior=self.vessel_prior)
         except ValueError as error:
@@ -205,11 +206,11 @@ class KnownTissues(KnownVessel):
             around = outlines(term, fidelity).image
             if around is not None:
                 image = presence * image + (1.0 - presence) * around
-        return Drawn(image, report={"tissues": read})
+        return KnownImage(image, report={"tissues": read})
 
 
-def _without(found: Drawn, why: str) -> Drawn:
-    """What was drawn without tissues, and the word that they are not used."""
+def _without(found: KnownImage, why: str) -> KnownImage:
+    """The image without tissues, with a warning that they are not used."""
     report = {"tissues": {"used": False, "why": why}}
     return replace(
         found,

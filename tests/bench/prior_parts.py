@@ -23,7 +23,7 @@ import torch
 from rival_scenes import DIRECTIONS, Bench, Place
 from torch import Tensor
 
-from recon.mbir.known import Drawn
+from recon.mbir.known import KnownImage
 from recon.mbir.mbir import Mbir
 from recon.mbir.network import bilateral_prior
 from recon.mbir.priors import prior_of
@@ -46,12 +46,12 @@ def _one_orientation(network: Mbir) -> Mbir:
 class _OneLength(KnownVessel):
     """What the layer holds is correlated over 0.5 mm in every direction."""
 
-    def drawn(self, *scan: Any) -> Drawn:
+    def image_of(self, *scan: Any) -> KnownImage:
         with mock.patch.object(LayerField.__init__, "__defaults__", ((0.5, 0.5, 0.5),)):
-            return super().drawn(*scan)
+            return super().image_of(*scan)
 
 
-def _drawn(network: Mbir) -> Mbir:
+def _with_vessel(network: Mbir) -> Mbir:
     return network.with_known(KnownVessel())
 
 
@@ -66,22 +66,24 @@ USES: dict[str, Callable[[Mbir], Mbir]] = {
         n.model, prior=prior_of("perona-malik")
     ),
     "the linear start alone": lambda n: Mbir(n.model, steps=0),
-    "around a drawn vessel": _drawn,
-    "drawn, what is in the layer correlated over 0.5 mm in every direction": lambda n: n.with_known(
-        _OneLength()
+    "around a vessel model": _with_vessel,
+    "vessel model, what is in the layer correlated over 0.5 mm in every direction": lambda n: (
+        n.with_known(_OneLength())
     ),
-    "drawn, eight turns of the network instead of four": lambda n: _drawn(
+    "vessel model, eight turns of the network instead of four": lambda n: _with_vessel(
         Mbir(n.model, prior=n.model.network)
     ),
-    "drawn, overshoot not cut off": lambda n: _drawn(Mbir(n.model, cut_overshoot=False)),
-    "drawn, nothing put back": lambda n: _drawn(Mbir(n.model, restore=False)),
-    "drawn, no data consistency at the end": lambda n: _drawn(
+    "vessel model, overshoot not cut off": lambda n: _with_vessel(
+        Mbir(n.model, cut_overshoot=False)
+    ),
+    "vessel model, nothing put back": lambda n: _with_vessel(Mbir(n.model, restore=False)),
+    "vessel model, no data consistency at the end": lambda n: _with_vessel(
         Mbir(n.model, final_data_consistency=False)
     ),
-    "drawn, the filtered view in the network's place": lambda n: _drawn(
+    "vessel model, the filtered view in the network's place": lambda n: _with_vessel(
         Mbir(n.model, prior=bilateral_prior)
     ),
-    "drawn, Perona and Malik's filter in the network's place": lambda n: _drawn(
+    "vessel model, Perona and Malik's filter in the network's place": lambda n: _with_vessel(
         Mbir(n.model, prior=prior_of("perona-malik"))
     ),
 }

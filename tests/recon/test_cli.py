@@ -17,7 +17,7 @@ from small_scan import GRID
 
 from recon.cli import main
 from recon.cli.parsing import as_options, saying
-from recon.mbir.known import Drawn
+from recon.mbir.known import KnownImage
 from recon.motion import InsetMotion
 from recon.study.results import README_MARKS
 from recon.vessel.known import KnownVessel
@@ -402,11 +402,15 @@ def test_a_path_is_written_beside_the_volume(here, cli, clean, monkeypatch):
 
 
 def test_what_a_drawn_vessel_has_changed_is_written_and_shown(here, cli, clean, monkeypatch):
-    monkeypatch.setattr(KnownVessel, "drawn", lambda self, term, _: Drawn(torch.zeros(term.shape)))
+    monkeypatch.setattr(
+        KnownVessel, "image_of", lambda self, term, _: KnownImage(torch.zeros(term.shape))
+    )
     clean.with_noise(1.0, 0).save("mine.h5")
     cli("reconstruct mine.h5 --method mbir --vessel --out a.nii.gz")
     report = json.loads((here / "a.nii.gz.json").read_text(encoding="utf-8"))
-    assert any("a vessel with smooth outlines was drawn" in text for text in report["warnings"])
+    assert any(
+        "a vessel model with smooth outlines was used" in text for text in report["warnings"]
+    )
     assert report["vessel_difference_hu"] == "a_vessel_difference.nii.gz"
     changed = Volume.load("a_vessel_difference.nii.gz").data
     cli("reconstruct mine.h5 --method mbir --out b.nii.gz")

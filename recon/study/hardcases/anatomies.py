@@ -45,7 +45,7 @@ def anatomy_verdict(recovered: float | None, soft: float, messages: Sequence[str
         recovered: see :func:`torchpcct.metrics.recovery.recovered_contrast`; None: refused.
         soft: of soft FBP.
         messages: of the volume with the feature beside those of the volume without it, and what
-            says that a vessel was drawn.
+            says that a vessel model was used.
     """
     if recovered is not None and recovered >= LEAST_RECOVERY * soft:
         return "right"
@@ -139,8 +139,8 @@ def _recovered(
             volumes.append(volume.data)
             texts.append([*volume.report.get("warnings", []), *messages])
         usual = set(map(kind, texts[1]))
-        # A drawing says of itself what it may leave out, whatever it draws.
-        unusual += [t for t in texts[0] if kind(t) not in usual or "was drawn, and disease" in t]
+        # A vessel model names what it may leave out, whatever it shows.
+        unusual += [t for t in texts[0] if kind(t) not in usual or "was used, and disease" in t]
         found.append(recovered_contrast(volumes[0] - volumes[1], truth))
     return float(np.mean(found)), list(dict.fromkeys(unusual))
 

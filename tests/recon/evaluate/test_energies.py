@@ -83,7 +83,7 @@ def test_weighted_volumes_are_in_hu_of_their_own(found):
     for method in ("fbp:soft", OWN):
         assert found["slope", method, "lesion"]["value"] == pytest.approx(0.97, abs=0.06)
     plain, weighted = (
-        found["dose factor: limit of the data", m, "lesion"]["value"] for m in ("fbp:soft", OWN)
+        found["dose factor: Cramér–Rao bound", m, "lesion"]["value"] for m in ("fbp:soft", OWN)
     )
     factor = found["dose factor: contrast at slope 1", OWN, "lesion"]["value"]
     assert weighted / plain == pytest.approx(factor, rel=0.03)

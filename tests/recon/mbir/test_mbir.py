@@ -10,7 +10,7 @@ from small_scan import CENTER, GRID
 
 from recon import reconstruct
 from recon.least_squares.inset_problem import InsetProblem
-from recon.mbir.known import Drawn
+from recon.mbir.known import KnownImage
 from recon.mbir.mbir import Mbir, average_onto, working_grid
 from recon.mbir.network import NetworkConfig
 from recon.mbir.unrolled import Unrolled, low_residual
@@ -192,26 +192,26 @@ def test_metal_is_outside_of_what_the_prior_knows(network):
 
 
 @pytest.fixture
-def always_drawn(monkeypatch):
-    """Something is drawn of every scan."""
+def always_known(monkeypatch):
+    """Something is known of every scan."""
 
-    def drawn(self, term, fidelity):
+    def image_of(self, term, fidelity):
         image = torch.full(term.shape, -90.0)
         image[2:6, 6:10, 6:10] = 60.0
-        return Drawn(image)
+        return KnownImage(image)
 
-    monkeypatch.setattr(KnownVessel, "drawn", drawn)
+    monkeypatch.setattr(KnownVessel, "image_of", image_of)
 
 
 def test_a_volume_says_what_was_drawn_and_what_that_changed(
-    clean, problem, network, always_drawn, tmp_path
+    clean, problem, network, always_known, tmp_path
 ):
     scan = clean.with_noise(2.0, 1)
     given = {"network": network, "problem": problem}
     plain = reconstruct(scan, GRID, "mbir", **given)
     assert "vessel" not in plain.report
     volume = reconstruct(scan, GRID, "mbir", vessel=True, **given)
-    assert volume.report["vessel"] == {"drawn": True}
+    assert volume.report["vessel"] == {"used": True}
     assert any("may be missing" in text for text in volume.report["warnings"])
     changed = volume.report["vessel_difference_hu"]
     assert float(changed.abs().max()) > 1.0
@@ -219,4 +219,4 @@ def test_a_volume_says_what_was_drawn_and_what_that_changed(
     volume.save(tmp_path / "v.h5")
     again = Volume.load(tmp_path / "v.h5").report
     assert torch.equal(again["vessel_difference_hu"], changed)
-    assert again["vessel"] == {"drawn": True}
+    assert again["vessel"] == {"used": True}

@@ -15,7 +15,7 @@ CENTER = (1.0, -30.0, 20.0)
 def test_verdicts_of_disease():
     assert anatomy_verdict(0.60, 0.63, []) == "right"  # 0.95 of what soft FBP shows
     assert anatomy_verdict(0.50, 0.63, []) == "SILENT"
-    assert anatomy_verdict(0.50, 0.63, ["a vessel was drawn"]) == "warned"
+    assert anatomy_verdict(0.50, 0.63, ["a vessel model was used"]) == "warned"
     assert anatomy_verdict(None, 0.63, ["refused"]) == "warned"
     assert anatomy_verdict(1.2, 0.63, []) == "right"
 

@@ -122,8 +122,8 @@ def test_a_core_is_drawn_as_far_as_it_is_probable(drawn, network, fine, monkeypa
     monkeypatch.setattr(
         known, "read_plaque", lambda *arguments, **settings: replace(reading, presence=0.25)
     )
-    around = KnownVessel().drawn(b, network.fidelity).image
-    found = KnownTissues().drawn(b, network.fidelity).image
+    around = KnownVessel().image_of(b, network.fidelity).image
+    found = KnownTissues().image_of(b, network.fidelity).image
     assert torch.allclose(found, 0.25 * torch.from_numpy(reading.image) + 0.75 * around, atol=1e-3)
     assert float((around - torch.from_numpy(reading.image)).abs().max()) > 20.0
 

@@ -29,7 +29,7 @@ def test_outlines_are_sharper_and_the_layer_keeps_what_the_data_show(drawn, netw
     truth = drawn_vessel.image(drawn.grid, 100.0)
     vessel = right_hand_side(drawn, drawn_vessel.image(drawn.gram.finer, 100.0, samples=3), None)
     (found,) = network.with_known(KnownVessel()).solve(vessel)
-    assert found.report["vessel"]["drawn"]
+    assert found.report["vessel"]["used"]
     plain, around = network(vessel)[0], found.volume
     inside = truth > -80
     error = [float((v - truth)[inside].square().mean().sqrt()) for v in (plain, around)]
@@ -44,7 +44,7 @@ def test_without_a_vessel_it_is_the_plain_reconstruction(drawn, network):
     (found,) = network.with_known(KnownVessel()).solve(b)
     assert torch.equal(found.volume, network(b)[0])
     assert "nothing stands out" in found.report["vessel"]["why"]
-    assert found.warnings == [f"no vessel was drawn: {found.report['vessel']['why']}"]
+    assert found.warnings == [f"no vessel model was used: {found.report['vessel']['why']}"]
 
 
 def test_outlines_that_leave_something_unexplained_are_not_drawn(drawn, network):
@@ -57,7 +57,7 @@ def test_outlines_that_leave_something_unexplained_are_not_drawn(drawn, network)
     near = (z - bright[0]) ** 2 + (y - bright[1] - 12) ** 2 + (x - bright[2]) ** 2 < 36
     b = right_hand_side(drawn, torch.where(near, torch.tensor(900.0), image), 3)
     (found,) = network.with_known(KnownVessel()).solve(b)
-    assert not found.report["vessel"]["drawn"]
+    assert not found.report["vessel"]["used"]
     assert torch.equal(found.volume, network(b)[0])
 
 
@@ -71,7 +71,7 @@ def test_what_lies_apart_from_a_vessel_does_not_speak_against_it(drawn, network)
     beside = torch.where(muscle[:, :, None], torch.tensor(0.0), image)
     b = right_hand_side(drawn, beside, 3)
     (found,) = network.with_known(KnownVessel()).solve(b)
-    assert found.report["vessel"]["drawn"], found.report
+    assert found.report["vessel"]["used"], found.report
     volumes = found.volume, network(b)[0]
     assert float((volumes[0] - volumes[1])[:, 0].mean()) == pytest.approx(0.0, abs=5.0)
 
@@ -94,7 +94,7 @@ def test_scenes_of_a_batch_are_what_they_are_alone(drawn, network, vessel):
     both = method.solve(Quadratic.joined([empty, vessel]))
     for k, alone in enumerate((empty, vessel)):
         assert torch.allclose(both[k].volume, method(alone)[0], atol=0.5)
-    assert [found.report["vessel"]["drawn"] for found in both] == [False, True]
+    assert [found.report["vessel"]["used"] for found in both] == [False, True]
     assert ["no vessel" in found.warnings[0] for found in both] == [True, False]
     assert "may be missing: compare" in both[1].warnings[0]
     (plain,) = method.with_known(None).solve(vessel)
@@ -124,7 +124,7 @@ def test_more_fidelity_leaves_more_of_the_contrast_and_of_the_noise(drawn, netwo
     contrast, noise = [], []
     for fidelity in (0.0, 1.0):
         clean, without, noisy = (
-            KnownVessel().drawn(right_hand_side(drawn, image, seed), fidelity).image
+            KnownVessel().image_of(right_hand_side(drawn, image, seed), fidelity).image
             for image, seed in ((images[0], None), (images[1], None), (images[1], 7))
         )
         contrast.append(float((without - clean)[core].mean()))
@@ -152,7 +152,7 @@ def test_all_values_moved_move_the_volume(drawn, network, vessel):
     changes = []
     for believed in (None, VesselPrior()):
         found = [network.with_known(KnownVessel(believed)).solve(b)[0] for b in (vessel, moved)]
-        assert all(f.report["vessel"]["drawn"] for f in found)
+        assert all(f.report["vessel"]["used"] for f in found)
         still, other = (f.volume for f in found)
         changes.append(float((other - still - 150.0)[still > -40].square().mean().sqrt()))
     assert changes[0] < min(5.0, 0.5 * changes[1]), changes
