@@ -57,7 +57,7 @@ def table(
         + (f" (less than {CERTAIN}: its figures are refused)" if reading.presence < CERTAIN else "")
         + (f"; calcifications: {reading.calcifications}" if reading.calcifications else "")
         if reading.explained and not reading.taken_off_hu
-        else "Plaque body: none can be told: "
+        else "Plaque body: none can be identified: "
         + (
             f"beside the vessel, {reading.taken_off_hu:.0f} HU were taken off the data"
             if reading.explained
@@ -164,7 +164,7 @@ def save(
     ``plaque.png``.
 
     Labels: 0 fat, 1 wall, 2 fibrous, 3 lumen, 4 core, 5 calcification, 6 second core; cores only
-    where they are certain, and no plaque body where none can be told.
+    where they are certain, and no plaque body where none can be identified.
 
     Args:
         reading: to write.

@@ -165,7 +165,7 @@ def residual_test(
                 f"at edges the data differ from the volume by many times their noise ({chi2:.4g} "
                 f"times their stated noise variance over all readings, {chi2_calm:.4g} beside "
                 "edges): the voxels are too coarse for data as clear as these, so that edges "
-                "ring, or the geometry is not that of the scan; smaller voxels tell"
+                "ring, or the geometry is not that of the scan; smaller voxels show which"
             )
         else:
             size, error = (chi2_calm, spread_calm) if above >= below else (chi2, spread)

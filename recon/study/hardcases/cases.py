@@ -636,7 +636,7 @@ _BODY: dict[str, Case] = {
     ),
     "exchanged": Case("two views exchanged", _read(_exchanged)),
     "lost-views": Case(
-        "five views lost, the others told evenly",
+        "five views lost, the angles taken for even",
         lambda clean, scan, rng: _turned(
             scan, full_turn(VIEWS - 5), torch.cat([scan.counts[:70], scan.counts[75:]])
         ),
@@ -848,7 +848,7 @@ def _tilted(clean: Scan, scan: Scan, rng: np.random.Generator) -> Scan:
 _CONE: dict[str, Case] = {
     "sound": Case("nothing", lambda clean, scan, rng: scan),
     "helix": _travelled(
-        "a helix of 20 mm a turn told as a circle", lambda angle: 20.0 * angle / (2 * math.pi)
+        "a helix of 20 mm a turn read as a circle", lambda angle: 20.0 * angle / (2 * math.pi)
     ),
     "sdd": _described("sdd 1 % too large", lambda g: replace(g, sdd=1.01 * g.sdd), _PLANE),
     "jitter": Case("angles jitter by 30 % of a step", _jitter(0.3)),

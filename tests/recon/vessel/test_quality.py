@@ -136,7 +136,7 @@ def test_beside_a_second_vessel_that_is_not_known_nothing_of_a_plaque_is_claimed
     assert "beside the vessel" in found.warnings[0]
     assert set(found.figures).isdisjoint(found.given_core)
     assert set(found.refused) == set(found.given_core)
-    assert "none can be told" in table(found)
+    assert "none can be identified" in table(found)
 
 
 def test_noise_alone_is_not_striking_anywhere_in_the_volume(gram):
