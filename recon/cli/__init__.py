@@ -30,7 +30,7 @@ from recon.cli.parsing import (
     check_limits,
     ending_by_signals,
     is_path,
-    saying,
+    showing_messages,
 )
 from recon.cli.plaque import add_plaque
 from recon.cli.reconstruct import add_reconstruct
@@ -156,7 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return demo_steps(options, main)
     options.command_line = words
     chosen = commands.choices[options.command]
-    with saying(chosen._actions, options.verbose) as options.warn, ending_by_signals():
+    with showing_messages(chosen._actions, options.verbose) as options.warn, ending_by_signals():
         return _run(options, chosen)
 
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 SCAN_ENDINGS = (".h5", ".hdf5")
 """Endings of scan files."""
 _BESIDE = (".json", ".yaml")
-"""Endings of summary and configuration, which :func:`tell` adds to the name of the result."""
+"""Endings of summary and configuration, which :func:`write_summary` adds to the result's name."""
 
 Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 """What ``add_subparsers`` gives."""
@@ -332,7 +332,9 @@ class _ShownOnce(logging.Handler):
 
 
 @contextmanager
-def saying(actions: Sequence[argparse.Action], verbose: bool) -> Iterator[Callable[[str], None]]:
+def showing_messages(
+    actions: Sequence[argparse.Action], verbose: bool
+) -> Iterator[Callable[[str], None]]:
     """While a command runs: what the library logs, what it warns of, and what the command adds,
     each shown once.
 
@@ -370,7 +372,7 @@ def as_json(value: object, inset: str = "") -> str:
     return brackets[0] + ",".join(f"\n{deeper}{line}" for line in lines) + f"\n{inset}{brackets[1]}"
 
 
-def tell(
+def write_summary(
     arguments: argparse.Namespace, short: str, config: dict[str, object], **summary: object
 ) -> None:
     """Write summary (JSON) and resolved configuration (YAML) beside the result, and print one
@@ -520,7 +522,7 @@ def check_output(
     Args:
         is_own: whether an existing file is one that this command would have made.
         inputs: files that the command reads, by whatever name.
-        beside: whether :func:`tell` writes beside it.
+        beside: whether :func:`write_summary` writes beside it.
 
     Raises:
         ValueError: an input, also by another name, or without ``--force`` something else is there

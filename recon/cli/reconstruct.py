@@ -29,8 +29,8 @@ from recon.cli.parsing import (
     is_picture,
     length_of,
     motion_beside,
-    tell,
     without_ending,
+    write_summary,
 )
 from recon.cli.scan_options import (
     add_reader_options,
@@ -357,7 +357,7 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
         volume = _with_path(volume, *motion_beside(arguments.out))
     volume.save(arguments.out)
     report = {**volume.report, "mean": float(volume.data.mean())}
-    _tell_volume(arguments, config, volume.grid, volume.unit, report)
+    _write_volume_summary(arguments, config, volume.grid, volume.unit, report)
 
 
 def _is_path_table(path: Path) -> bool:
@@ -463,10 +463,12 @@ def _reconstruct_slabs(
         **options,
     )
     progress.close()
-    _tell_volume(arguments, config, grid, source.unit, {**report, **_provenance(arguments)})
+    _write_volume_summary(
+        arguments, config, grid, source.unit, {**report, **_provenance(arguments)}
+    )
 
 
-def _tell_volume(
+def _write_volume_summary(
     arguments: argparse.Namespace,
     config: JsonObject,
     grid: VolumeGrid,
@@ -483,7 +485,7 @@ def _tell_volume(
     for text in report.get("warnings", []):
         arguments.warn(text)
     place = {f"spacing_{length}": list(grid.spacing), f"center_{length}": list(grid.center)}
-    tell(arguments, short, config, shape=list(grid.shape), **place, unit=unit, **report)
+    write_summary(arguments, short, config, shape=list(grid.shape), **place, unit=unit, **report)
 
 
 def add_reconstruct(commands: Commands) -> None:

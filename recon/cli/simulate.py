@@ -18,8 +18,8 @@ from recon.cli.parsing import (
     check_ending,
     check_output,
     command,
-    tell,
     without_ending,
+    write_summary,
 )
 from recon.cli.scan_options import add_reader_options, reader_options
 from torchpcct.files import (
@@ -125,7 +125,7 @@ def _simulate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     )
     if voxels:
         short += f"; {_dense(scan.info['plan']['above_muscle'])}"
-    tell(
+    write_summary(
         arguments,
         short,
         config.values,
@@ -238,7 +238,7 @@ def _lower_dose(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         f"dose ({how})"
     )
     config = {"scan": str(arguments.scan), "geometry": geometry_values(scan.geometry), **note}
-    tell(
+    write_summary(
         arguments,
         short,
         config,

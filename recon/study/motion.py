@@ -31,7 +31,7 @@ from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.mbir.mbir import Mbir
 from recon.motion import estimate_motion
 from recon.study.figures import curve_axes, middle_panel, plaque_panel
-from recon.study.motion_estimates import CASES, found_paths
+from recon.study.motion_estimates import CASES, estimated_paths
 from recon.study.paper import published as paper
 from recon.study.paper.plaque_scan import (
     SCANNERS,
@@ -102,10 +102,10 @@ class MotionSettings(StudySettings):
         exposure_s: of the noisy reconstructions.
         seed, realizations: of their noise; realisation i uses ``seed + i``.
         methods: of the compensation, of ``"fbp"`` (always), ``"pwls"``, ``"mbir"``.
-        found_mm: amplitudes of the motions that are estimated from the scan itself, mm.
-        found_exposures_s: exposures of these estimates.
-        found_cases: of :data:`recon.study.motion_estimates.CASES`.
-        found_draws: noise realisations of each.
+        estimated_mm: amplitudes of the motions that are estimated from the scan itself, mm.
+        estimated_exposures_s: exposures of these estimates.
+        estimated_cases: of :data:`recon.study.motion_estimates.CASES`.
+        estimated_realisations: noise realisations of each.
     """
 
     thinning: int = 1
@@ -121,10 +121,10 @@ class MotionSettings(StudySettings):
     seed: int = 0
     realizations: int = 2
     methods: tuple[str, ...] = tuple(METHODS)
-    found_mm: tuple[float, ...] = (0.2, 0.4, 0.8, 1.2, 2.0)
-    found_exposures_s: tuple[float, ...] = (2.0, 0.35)
-    found_cases: tuple[str, ...] = tuple(CASES)
-    found_draws: int = 5
+    estimated_mm: tuple[float, ...] = (0.2, 0.4, 0.8, 1.2, 2.0)
+    estimated_exposures_s: tuple[float, ...] = (2.0, 0.35)
+    estimated_cases: tuple[str, ...] = tuple(CASES)
+    estimated_realisations: int = 5
 
     # An eighth of the views, four residual motions, one error of the estimate, no PWLS.
     QUICK: ClassVar[dict[str, object]] = {
@@ -133,15 +133,15 @@ class MotionSettings(StudySettings):
         "errors": (0.10,),
         "realizations": 1,
         "methods": ("fbp", "mbir"),
-        "found_mm": (0.4, 1.2),
-        "found_draws": 1,
+        "estimated_mm": (0.4, 1.2),
+        "estimated_realisations": 1,
     }
 
     def __post_init__(self) -> None:
-        self.check_whole(thinning=1, realizations=1, seed=0, found_draws=1)
-        for case in self.found_cases:
-            choice("found_cases", case, tuple(CASES))
-        for name in ("found_mm", "found_exposures_s"):
+        self.check_whole(thinning=1, realizations=1, seed=0, estimated_realisations=1)
+        for case in self.estimated_cases:
+            choice("estimated_cases", case, tuple(CASES))
+        for name in ("estimated_mm", "estimated_exposures_s"):
             for value in getattr(self, name):
                 number(name, value, positive=True)
         for name in ("amplitude_mm", "rate_bpm", "rotation_s", "voxel_mm", "exposure_s"):
@@ -169,8 +169,8 @@ class MotionSettings(StudySettings):
 
 
 @dataclass
-class Found:
-    """What was seen.
+class MotionImages:
+    """The images of the study, by scanner, motion and method.
 
     Attributes:
         at_rest: scanner → what the still vessel's image shows; its reference.
@@ -196,7 +196,7 @@ def measure(
 ) -> Measured:
     """Simulate and reconstruct residual motion in both scanners, and compensate the PCCT's, in
     resumable pieces."""
-    s, pieces, m = settings, Pieces(folder, settings), Found()
+    s, pieces, m = settings, Pieces(folder, settings), MotionImages()
     scene, plaque = plaque_scene()
     reference = Reference.of(scene, plaque, inset_grid(plaque, s.voxel_mm))
     pieces.ahead(*_step(s))
@@ -217,7 +217,7 @@ def measure(
             )
     paths = pieces.within("found")
     data |= {
-        "found": found_paths(s, reference.grid, paths, partial(progress, "estimates")),
+        "estimates": estimated_paths(s, reference.grid, paths, partial(progress, "estimates")),
         "at_rest": {name: o.measures for name, o in m.at_rest.items()},
         "residual": [
             {"scanner": name, "fraction": f, "in_place": here.measures, "moved_back": back.measures}
@@ -248,7 +248,12 @@ def _step(s: MotionSettings) -> Step:
 
 
 def _residual(
-    s: MotionSettings, m: Found, name: str, reference: Reference, pieces: Pieces, progress: Progress
+    s: MotionSettings,
+    m: MotionImages,
+    name: str,
+    reference: Reference,
+    pieces: Pieces,
+    progress: Progress,
 ) -> tuple[Scan, Scan]:
     """Images with residual motion; returns the scans at rest and of the largest motion."""
     grid = reference.grid
@@ -517,7 +522,7 @@ def _error_map(found: PlaqueImage, rest: PlaqueImage) -> Panel:
     return middle_panel((found.image - rest.image) * (width / _ERROR_WIDTH_HU) + center)
 
 
-def _images(m: Found) -> Figure:
+def _images(m: MotionImages) -> Figure:
     """PCCT and EID-CT with residual motion and their error maps; then the compensated images."""
     rows: list[list[Panel]] = []
     labels = []
@@ -565,7 +570,7 @@ def _images(m: Found) -> Figure:
     return figure
 
 
-def _curves(s: MotionSettings, m: Found) -> Figure:
+def _curves(s: MotionSettings, m: MotionImages) -> Figure:
     """NRMSE, lumen area and depth of the core's basin against residual motion, uncompensated and
     compensated."""
     figure, axes = curve_axes(

@@ -26,7 +26,7 @@ from torchpcct.scene.plaque import Plaque, plaque_scene
 if TYPE_CHECKING:
     from torchpcct.typing import JsonObject
 
-__all__ = ["CASES", "AlongAxis", "JumpMotion", "found_paths", "motion_or_refusal"]
+__all__ = ["CASES", "AlongAxis", "JumpMotion", "estimated_paths", "motion_or_refusal"]
 
 _SECOND_MM = (-3.3, 0.0)
 """Where the second vessel lies beside the plaque's, x and y, on the side away from the plaque."""
@@ -36,7 +36,7 @@ _SECOND_MOST_MM = 0.8
 """Largest motion at which the two do not meet."""
 
 
-class FoundSettings(Protocol):
+class EstimateSettings(Protocol):
     """What :class:`recon.study.motion.MotionSettings` says of the estimates."""
 
     @property
@@ -48,13 +48,13 @@ class FoundSettings(Protocol):
     @property
     def seed(self) -> int: ...
     @property
-    def found_cases(self) -> tuple[str, ...]: ...
+    def estimated_cases(self) -> tuple[str, ...]: ...
     @property
-    def found_mm(self) -> tuple[float, ...]: ...
+    def estimated_mm(self) -> tuple[float, ...]: ...
     @property
-    def found_exposures_s(self) -> tuple[float, ...]: ...
+    def estimated_exposures_s(self) -> tuple[float, ...]: ...
     @property
-    def found_draws(self) -> int: ...
+    def estimated_realisations(self) -> int: ...
 
 
 @dataclass(frozen=True)
@@ -106,8 +106,8 @@ CASES: Mapping[str, Callable[[float, float], tuple[SinusoidalMotion, ...]]] = {
 """Motions by name: of an amplitude in mm, and beats a minute."""
 
 
-def found_paths(
-    s: FoundSettings, grid: VolumeGrid, pieces: Pieces, progress: Callable[[float], None]
+def estimated_paths(
+    s: EstimateSettings, grid: VolumeGrid, pieces: Pieces, progress: Callable[[float], None]
 ) -> list[JsonObject]:
     """One row for each case, amplitude and exposure.
 
@@ -127,8 +127,8 @@ def found_paths(
     """
     jobs = [
         (case, mm)
-        for case in s.found_cases
-        for mm in (s.found_mm if case != "at rest" else s.found_mm[:1])
+        for case in s.estimated_cases
+        for mm in (s.estimated_mm if case != "at rest" else s.estimated_mm[:1])
         if "vessels" not in case or mm <= _SECOND_MOST_MM
     ]
     rows = []
@@ -137,9 +137,9 @@ def found_paths(
         short = case.replace(",", "").replace(" ", "-")
         scan = pieces(f"{short}_{mm:g}", partial(_scan, s, grid, motions, "vessels" in case))
         truth = _truth(motions, scan, s.rotation_s)
-        for exposure in s.found_exposures_s:
+        for exposure in s.estimated_exposures_s:
             name = f"{short}_{mm:g}_{exposure:g}"
-            seeds = range(s.seed, s.seed + s.found_draws)
+            seeds = range(s.seed, s.seed + s.estimated_realisations)
             found = pieces(name, partial(_estimates, scan, grid, exposure * s.thinning, seeds))
             row = {"case": case, "mm": mm if motions else 0.0, "exposure_s": exposure}
             rows.append(row | _row(found, None if "apart" in case else truth))
@@ -148,7 +148,7 @@ def found_paths(
 
 
 def _scan(
-    s: FoundSettings, grid: VolumeGrid, motions: tuple[SinusoidalMotion, ...], two: bool
+    s: EstimateSettings, grid: VolumeGrid, motions: tuple[SinusoidalMotion, ...], two: bool
 ) -> Scan:
     scanner = SCANNERS["PCCT"](paper.FULL_VIEWS["PCCT"] // s.thinning)
     x, y, z = Plaque().position

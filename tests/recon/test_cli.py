@@ -16,7 +16,7 @@ from foreign_files import data_exchange
 from small_scan import GRID
 
 from recon.cli import main
-from recon.cli.parsing import as_options, saying
+from recon.cli.parsing import as_options, showing_messages
 from recon.mbir.known import KnownImage
 from recon.motion import InsetMotion
 from recon.study.results import README_MARKS
@@ -326,7 +326,7 @@ def test_the_example_of_a_stack_is_complete(cli):
 
 def test_a_warning_is_said_once_and_in_the_words_of_the_command(capsys):
     actions = [argparse.ArgumentParser().add_argument("--pitch", metavar="MM")]
-    with saying(actions, verbose=False) as warn:
+    with showing_messages(actions, verbose=False) as warn:
         logging.getLogger("recon.api").warning("%s", "too few: give pitch=")
         warnings.simplefilter("always")
         warnings.warn("too few: give pitch=", UserWarning, stacklevel=1)
