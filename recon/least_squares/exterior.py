@@ -56,7 +56,7 @@ def length_unit(geometry: ConeBeam) -> float:
     with all lengths times any number, in another unit or of a smaller scanner, gives the same
     image.
     """
-    return geometry.pitch[1] / geometry.magnification / CELL_MM
+    return geometry.cell / CELL_MM
 
 
 class UnknownExterior:

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from recon.data_term import Quadratic
-from recon.least_squares.exterior import CELL_MM, length_unit
 from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.mbir import Mbir, average_onto, working_grid
 from recon.result import RESIDUAL_TEST, Result, tested
@@ -113,7 +112,7 @@ class Inset:
 def _check_cells(scan: Scan, voxel_mm: float) -> None:
     """Refuse a scanner, or a unit of length, on which the network's voxels mean nothing
     (ValueError)."""
-    cell = length_unit(scan.geometry) * CELL_MM
+    cell = scan.geometry.cell
     if not 1.0 / FARTHEST_CELL <= cell / voxel_mm <= FARTHEST_CELL:
         raise ValueError(
             f"MBIR of an inset works on voxels of {voxel_mm:g} mm, what its network was trained "
