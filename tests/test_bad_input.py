@@ -158,8 +158,8 @@ TABLE = [
     (full_turn, {"views": 8}, {"views": COUNT}),
     (
         sd_interval,
-        {"sd": 1.0, "realizations": 10, "level": 0.9},
-        {"sd": (*NO_NUMBER, NAN, INF, -1.0), "realizations": (*COUNT, 1), "level": LEVEL},
+        {"sd": 1.0, "realisations": 10, "level": 0.9},
+        {"sd": (*NO_NUMBER, NAN, INF, -1.0), "realisations": (*COUNT, 1), "level": LEVEL},
     ),
     (
         cnr_interval,

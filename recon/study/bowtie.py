@@ -118,7 +118,7 @@ class BowtieSettings(StudySettings):
         exposure_s: of the scans for dose and noise, at 1000 mA.
         views: of the slices' scans.
         kernel: reconstruction kernel of the slices (the paper does not name it).
-        realizations: of the slices' noise.
+        realisations: of the slices' noise.
         detector: ``"eid"``, the energy-integrating one of the paper, or ``"silicon"``, the
             photon-counting one.
         map_mm: voxels of the thorax's dose map; that of the phantom has half of them, at least 1
@@ -126,35 +126,35 @@ class BowtieSettings(StudySettings):
         histories: photons of each Monte Carlo run; 0: no scatter.
         plaque_views: of the plaque's scans; fewer than the paper's keep the tube load.
         plaque_doses: exposures of the plaque's scans in s.
-        plaque_realizations: paired realisations for MBIR; controlling them needs at least 8.
+        plaque_realisations: paired realisations for MBIR; controlling them needs at least 8.
         seed: of the first realisation and of the Monte Carlo.
     """
 
     exposure_s: float = 0.35
     views: int = paper.FULL_VIEWS["PCCT"]
     kernel: str = "standard"
-    realizations: int = 4
+    realisations: int = 4
     detector: str = "eid"
     map_mm: float = 2.0
     histories: int = 2_000_000
     plaque_views: int = paper.FULL_VIEWS["PCCT"] // 2
     plaque_doses: tuple[float, ...] = (0.35, 2.0)
-    plaque_realizations: int = 40
+    plaque_realisations: int = 40
     seed: int = 0
 
     QUICK: ClassVar = {
         "views": 492,
-        "realizations": 2,
+        "realisations": 2,
         "map_mm": 6.0,
         "histories": 100_000,
         "plaque_views": 123,
         "plaque_doses": (2.0,),
-        "plaque_realizations": 8,
+        "plaque_realisations": 8,
     }
 
     def __post_init__(self) -> None:
         self.check_whole(
-            views=8, realizations=2, histories=0, plaque_views=8, plaque_realizations=8, seed=0
+            views=8, realisations=2, histories=0, plaque_views=8, plaque_realisations=8, seed=0
         )
         if 0 < self.histories < 10_000:
             raise ValueError(
@@ -241,7 +241,7 @@ def _kept(settings: BowtieSettings, pieces: Pieces, name: str) -> Any:
         if kind == "noise":
             scanners, seeds = (
                 wide_scanners(s.views, s.detector),
-                range(s.seed, s.seed + s.realizations),
+                range(s.seed, s.seed + s.realisations),
             )
             return noise(scene, phantoms()[scene], scanners, s.exposure_s, s.kernel, seeds)
         scanners = wide_scanners(8)
@@ -584,7 +584,7 @@ def _evaluated(
         list(tasks.values()),
         ["fbp:soft", "mbir"],
         exposures_s=s.plaque_doses,
-        n=s.plaque_realizations,
+        n=s.plaque_realisations,
         seed=s.seed,
         folder=folder,
         progress=progress,

@@ -100,7 +100,7 @@ class MotionSettings(StudySettings):
         errors: errors of the amplitude that the compensation assumes, of the whole one.
         voxel_mm: of all volumes.
         exposure_s: of the noisy reconstructions.
-        seed, realizations: of their noise; realisation i uses ``seed + i``.
+        seed, realisations: of their noise; realisation i uses ``seed + i``.
         methods: of the compensation, of ``"fbp"`` (always), ``"pwls"``, ``"mbir"``.
         estimated_mm: amplitudes of the motions that are estimated from the scan itself, mm.
         estimated_exposures_s: exposures of these estimates.
@@ -119,7 +119,7 @@ class MotionSettings(StudySettings):
     voxel_mm: float = 0.2
     exposure_s: float = paper.TABLE_EXPOSURE_S
     seed: int = 0
-    realizations: int = 2
+    realisations: int = 2
     methods: tuple[str, ...] = tuple(METHODS)
     estimated_mm: tuple[float, ...] = (0.2, 0.4, 0.8, 1.2, 2.0)
     estimated_exposures_s: tuple[float, ...] = (2.0, 0.35)
@@ -131,14 +131,14 @@ class MotionSettings(StudySettings):
         "thinning": 8,
         "fractions": (0.1, 0.4, 0.6, 1.0),
         "errors": (0.10,),
-        "realizations": 1,
+        "realisations": 1,
         "methods": ("fbp", "mbir"),
         "estimated_mm": (0.4, 1.2),
         "estimated_realisations": 1,
     }
 
     def __post_init__(self) -> None:
-        self.check_whole(thinning=1, realizations=1, seed=0, estimated_realisations=1)
+        self.check_whole(thinning=1, realisations=1, seed=0, estimated_realisations=1)
         for case in self.estimated_cases:
             choice("estimated_cases", case, tuple(CASES))
         for name in ("estimated_mm", "estimated_exposures_s"):
@@ -228,7 +228,7 @@ def measure(
                 "method": method,
                 "error": error,
                 "noisy": noisy,
-                "realizations": [o.measures for o in found],
+                "realisations": [o.measures for o in found],
             }
             for (method, error, noisy), found in m.compensated.items()
         ],
@@ -369,7 +369,7 @@ def compensate(
             term = term.times(s.exposure_s / NOISE_FREE_EXPOSURE_S)
         return network(term)[0]
 
-    noise: list[int | None] = [None, *range(s.seed, s.seed + s.realizations)]
+    noise: list[int | None] = [None, *range(s.seed, s.seed + s.realisations)]
     found: dict[Key, list[PlaqueImage]] = {}
     rest: dict[str, Tensor] = {}
     for k, seed in enumerate(noise):
@@ -439,7 +439,7 @@ def _borne(data: JsonObject) -> JsonObject:
     estimates: dict[str, list[JsonObject]] = {}
     for c in data["compensated"]:
         if not c["noisy"] and c["error"] not in (None, ESTIMATED):
-            estimates.setdefault(c["method"], []).append(c["realizations"][0])
+            estimates.setdefault(c["method"], []).append(c["realisations"][0])
     whole = {name: found for name, found in estimates.items() if len(found) == len(errors)}
     return {
         "contrast": _up_to(s["fractions"], [kept(o) for o in series]),

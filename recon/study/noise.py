@@ -63,7 +63,7 @@ _SQUARES = 4
 """Realisations per dose of which every reading's squared deviation is summed: 10⁶ independent
 readings pin the variance of an ROI mean down to some 0.1 %, which a few hundred ROI means do not.
 """
-_TEN = paper.REALIZATIONS
+_TEN = paper.REALISATIONS
 """Realisations of the paper's tables."""
 _BOOTSTRAP = 40_000
 """Resamplings of intervals that hold for all pairs of settings together."""
@@ -76,7 +76,7 @@ class NoiseSettings(StudySettings):
     """Settings of the noise study.
 
     Args:
-        realizations: paired noise realisations per dose, at least 10 (the paper's number).
+        realisations: paired noise realisations per dose, at least 10 (the paper's number).
         seed: first seed; realisation i uses ``seed + i`` at every dose.
         views: views per rotation. Fewer than the paper's keep the tube load of the whole scan.
         kernels, voxels_mm: of FBP.
@@ -85,7 +85,7 @@ class NoiseSettings(StudySettings):
         experiments: number of simulated experiments of 10 realisations.
     """
 
-    realizations: int = 200
+    realisations: int = 200
     seed: int = 0
     views: int = paper.FULL_VIEWS["PCCT"]
     kernels: tuple[str, ...] = paper.KERNELS
@@ -96,7 +96,7 @@ class NoiseSettings(StudySettings):
 
     # An eighth of the views, two kernels, three voxel sizes, two doses.
     QUICK: ClassVar[dict[str, object]] = {
-        "realizations": 40,
+        "realisations": 40,
         "views": 246,
         "kernels": ("soft", "standard"),
         "voxels_mm": (0.20, 0.25, 0.40),
@@ -106,7 +106,7 @@ class NoiseSettings(StudySettings):
     }
 
     def __post_init__(self) -> None:
-        self.check_whole(realizations=10, seed=0, views=8, reconstructed=1, experiments=100)
+        self.check_whole(realisations=10, seed=0, views=8, reconstructed=1, experiments=100)
         if len(self.kernels) * len(self.voxels_mm) < 2:
             raise ValueError(
                 "a ranking needs at least two settings: give more kernels or voxels_mm"
@@ -221,8 +221,8 @@ def _realisations(
     quiet = near.line_integrals().flatten()
     means: dict[float, Floats] = {}
     variances: dict[float, Floats] = {}
-    total = len(settings.doses) * settings.realizations
-    n = settings.realizations
+    total = len(settings.doses) * settings.realisations
+    n = settings.realisations
     for exposure in settings.doses.values():
 
         def block(first: int, exposure: float = exposure) -> tuple[Floats, Floats]:
@@ -258,7 +258,7 @@ def _reconstructions(
     ``means`` ``(n, S, 2)``."""
     images: list[Tensor] = []
     differences = []
-    for i in range(min(settings.reconstructed, settings.realizations)):
+    for i in range(min(settings.reconstructed, settings.realisations)):
         volumes = scanned.fbp(
             scanned.clean.with_noise(settings.table_exposure_s, settings.seed + i)
         )
@@ -643,7 +643,7 @@ def _cnrs(s: NoiseSettings, rows: list[JsonObject]) -> Figure:
             capsize=2,
             color="tab:blue",
             linewidth=1,
-            label=f"n = {s.realizations}, 95 %",
+            label=f"n = {s.realisations}, 95 %",
         )
         entries = [r["paper"]["cnr"] for r in own if r["paper"] is not None]
         if len(entries) == len(own):

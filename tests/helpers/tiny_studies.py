@@ -21,12 +21,12 @@ TINY: dict[str, dict[str, Any]] = {
     "detector": {"photons": 4000, "dead_times_ns": (50.0,), "charge_sharing": (0.1,)},
     "bowtie": {
         "views": 96,
-        "realizations": 2,
+        "realisations": 2,
         "map_mm": 12.0,
         "histories": 20_000,
         "plaque_views": 40,
         "plaque_doses": (2.0,),
-        "plaque_realizations": 8,
+        "plaque_realisations": 8,
     },
     "hardcases": {
         "views": 120,
@@ -51,7 +51,7 @@ TINY: dict[str, dict[str, Any]] = {
         "eid_fractions": (0.2,),
         "errors": (0.2,),
         "voxel_mm": 0.4,
-        "realizations": 1,
+        "realisations": 1,
         "exposure_s": 20.0,
         "methods": ("fbp", "pwls"),
         "estimated_cases": ("along x",),
@@ -66,7 +66,7 @@ TINY: dict[str, dict[str, Any]] = {
         "exposures_s": (2.0,),
     },
     "noise": {
-        "realizations": 24,
+        "realisations": 24,
         "views": 48,
         "kernels": ("soft", "bone"),
         "voxels_mm": (0.25, 0.40),
@@ -87,8 +87,8 @@ TINY: dict[str, dict[str, Any]] = {
     "spectral": {
         "views": 60,
         "voxel_mm": 0.4,
-        "realizations": 2,
-        "mbir_realizations": 1,
+        "realisations": 2,
+        "mbir_realisations": 1,
         "noise_levels": (0.0, 1.0),
         "calibration_views": 60,
         "transport_photons": 50_000,

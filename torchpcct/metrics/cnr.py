@@ -91,8 +91,8 @@ def cnr_from_moments(
 
 
 @checked
-def sd_interval(sd: float, realizations: int, level: float = 0.95) -> tuple[float, float]:
-    """χ² interval for a standard deviation estimated from ``realizations`` normal draws: ×[0.69,
+def sd_interval(sd: float, realisations: int, level: float = 0.95) -> tuple[float, float]:
+    """χ² interval for a standard deviation estimated from ``realisations`` normal draws: ×[0.69,
     1.83] at n = 10.
 
     Raises:
@@ -100,10 +100,10 @@ def sd_interval(sd: float, realizations: int, level: float = 0.95) -> tuple[floa
             outside (0, 1).
         TypeError: a number of realisations that is not whole.
     """
-    whole("realizations", realizations, low=2)
+    whole("realisations", realisations, low=2)
     number("sd", sd, low=0.0)
     coverage("level", level)
-    dof = realizations - 1
+    dof = realisations - 1
     high, low = stats.chi2.ppf([0.5 - level / 2, 0.5 + level / 2], dof)
     return float(sd * np.sqrt(dof / low)), float(sd * np.sqrt(dof / high))
 
@@ -164,7 +164,7 @@ def cnr_interval(
 def cnr_range(
     means: ArrayLike,
     covariance: ArrayLike,
-    realizations: int,
+    realisations: int,
     level: float = 0.95,
     draws: int = 20_000,
     seed: int = 0,
@@ -175,7 +175,7 @@ def cnr_range(
     Args:
         means: ``(foreground, background)`` expectations in HU.
         covariance: ``(2, 2)`` covariance of the two ROI means in HU².
-        realizations: size of the experiment, at least 3.
+        realisations: size of the experiment, at least 3.
         level: probability that the range covers, in (0, 1).
         draws: simulated experiments, whose quantiles are the range.
         seed: of these draws.
@@ -187,8 +187,8 @@ def cnr_range(
         ValueError: fewer than 3 realisations, a level outside (0, 1), or a covariance that is not
             positive definite.
     """
-    if realizations < 3:
-        raise ValueError(f"realizations must be at least 3, got {realizations}")
+    if realisations < 3:
+        raise ValueError(f"realisations must be at least 3, got {realisations}")
     coverage("level", level)
     try:
         root = np.linalg.cholesky(np.asarray(covariance, dtype=np.float64))
@@ -198,9 +198,9 @@ def cnr_range(
         ) from None
     rng = generator(seed)
     mean = np.asarray(means, dtype=np.float64) + rng.standard_normal((draws, 2)) @ root.T / np.sqrt(
-        realizations
+        realisations
     )
-    scatter = root @ _bartlett(rng, draws, realizations - 1) / np.sqrt(realizations - 1)
+    scatter = root @ _bartlett(rng, draws, realisations - 1) / np.sqrt(realisations - 1)
     estimates = (mean[:, 1] - mean[:, 0]) / np.sqrt(np.einsum("dij,dij->d", scatter, scatter))
     low, high = np.quantile(estimates, [0.5 - level / 2, 0.5 + level / 2])
     return float(low), float(high)

@@ -42,16 +42,16 @@ def generator(seed: int) -> np.random.Generator:
     return np.random.default_rng(whole("seed", seed, low=0))
 
 
-def resampling(realizations: int, draws: int, seed: int) -> NDArray[np.int64]:
-    """``(draws, realizations)`` indices with replacement. The same arguments give the same
+def resampling(realisations: int, draws: int, seed: int) -> NDArray[np.int64]:
+    """``(draws, realisations)`` indices with replacement. The same arguments give the same
     indices: paired."""
-    return generator(seed).integers(0, realizations, (draws, realizations))
+    return generator(seed).integers(0, realisations, (draws, realisations))
 
 
-def leave_one_out(realizations: int) -> NDArray[np.int64]:
-    """``(realizations, realizations − 1)`` indices, row i without i."""
-    index = np.arange(realizations - 1)
-    return index + (index >= np.arange(realizations)[:, None])
+def leave_one_out(realisations: int) -> NDArray[np.int64]:
+    """``(realisations, realisations − 1)`` indices, row i without i."""
+    index = np.arange(realisations - 1)
+    return index + (index >= np.arange(realisations)[:, None])
 
 
 def bca_interval(
@@ -65,7 +65,7 @@ def bca_interval(
     Args:
         value: the figure of all realisations.
         draws: ``(draws,)`` of the resampled ones.
-        jackknife: ``(realizations,)`` with one left out; not finite: no acceleration.
+        jackknife: ``(realisations,)`` with one left out; not finite: no acceleration.
         level: coverage, in (0, 1).
     """
     coverage("level", level)

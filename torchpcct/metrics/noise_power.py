@@ -30,12 +30,12 @@ class NoisePower:
         power: ``(y, x)`` or ``(z, y, x)`` HU² mm², HU² mm³; frequencies in the order of
             ``numpy.fft.fftfreq``.
         spacing: voxel size in mm per axis.
-        realizations: size of the ensemble.
+        realisations: size of the ensemble.
     """
 
     power: Floats
     spacing: tuple[float, ...]
-    realizations: int
+    realisations: int
 
     @property
     def frequencies(self) -> tuple[Floats, ...]:
@@ -74,11 +74,11 @@ class NoisePower:
 
 
 @checked
-def noise_power_spectrum(realizations: object, spacing: float | tuple[float, ...]) -> NoisePower:
+def noise_power_spectrum(realisations: object, spacing: float | tuple[float, ...]) -> NoisePower:
     """Noise power spectrum of an ensemble.
 
     Args:
-        realizations: ``(n, y, x)`` or ``(n, z, y, x)`` array or tensor in HU, at least 2
+        realisations: ``(n, y, x)`` or ``(n, z, y, x)`` array or tensor in HU, at least 2
             realisations of one object.
         spacing: voxel size in mm, one number or one per axis.
 
@@ -86,17 +86,17 @@ def noise_power_spectrum(realizations: object, spacing: float | tuple[float, ...
         ValueError: fewer than 2 realisations, a wrong number of axes, a spacing that is not
             positive, NaN or Inf.
     """
-    x = as_array(realizations)
+    x = as_array(realisations)
     if x.ndim not in (3, 4) or x.shape[0] < 2:
         raise ValueError(
-            f"realizations must be (n ≥ 2, y, x) or (n ≥ 2, z, y, x), got the shape {x.shape}"
+            f"realisations must be (n ≥ 2, y, x) or (n ≥ 2, z, y, x), got the shape {x.shape}"
         )
     per = per_axis("spacing", spacing, x.ndim - 1, positive=True, unit="mm")
     n = x.shape[0]
     mean = x.mean(0, dtype=np.float64)
     if not np.isfinite(mean).all():
         raise ValueError(
-            "realizations hold NaN or Inf: check the reconstruction before measuring it"
+            "realisations hold NaN or Inf: check the reconstruction before measuring it"
         )
     power = np.zeros(x.shape[1:])
     for image in x:

@@ -3,7 +3,7 @@ to.
 
 Source: Li, Wu, Pack, Wu, De Man, Wang, Nieman, Wang, "Coronary Atherosclerotic Plaque
 Characterization with Photon-counting CT: a Simulation-based Feasibility Study", tables "Statistics
-on the means of the ROI over 10 realizations" and "Necrotic core detectability measured as the CNR".
+on the means of the ROI over 10 realisations" and "Necrotic core detectability measured as the CNR".
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TABLE_EXPOSURE_S = 2.00
 """Exposure of both tables. The paper does not state it; the text of its noise section and the size
 of its standard deviations point to the assumed 5.7× dose (an inference of ours)."""
 
-REALIZATIONS = 10
+REALISATIONS = 10
 """Noise realisations of each setting."""
 
 

@@ -80,8 +80,8 @@ class SpectralSettings(StudySettings):
     Args:
         exposure_s: of the standard noise (the paper does not state it; 2.0 s is the exposure of its
             tables).
-        realizations: of the noise, for tissue maps by FBP.
-        mbir_realizations: of these, how many are reconstructed by joint MBIR at every noise level;
+        realisations: of the noise, for tissue maps by FBP.
+        mbir_realisations: of these, how many are reconstructed by joint MBIR at every noise level;
             0: none.
         noise_levels: shares of the standard noise, ascending, 0 first.
         views: per rotation.
@@ -98,8 +98,8 @@ class SpectralSettings(StudySettings):
     """
 
     exposure_s: float = 2.0
-    realizations: int = 4
-    mbir_realizations: int = 2
+    realisations: int = 4
+    mbir_realisations: int = 2
     noise_levels: tuple[float, ...] = (0.0, 0.25, 0.5, 1.0)
     views: int = paper.FULL_VIEWS["PCCT"]
     voxel_mm: float = 0.2
@@ -113,15 +113,15 @@ class SpectralSettings(StudySettings):
 
     QUICK: ClassVar = {
         "views": 246,
-        "realizations": 1,
-        "mbir_realizations": 1,
+        "realisations": 1,
+        "mbir_realisations": 1,
         "calibration_views": 0,
     }
 
     def __post_init__(self) -> None:
         number("exposure_s", self.exposure_s, positive=True, unit="s")
         number("voxel_mm", self.voxel_mm, positive=True, unit="mm")
-        self.check_whole(realizations=1, mbir_realizations=0, views=60, seed=0)
+        self.check_whole(realisations=1, mbir_realisations=0, views=60, seed=0)
         self.check_whole(calibration_views=0, transport_photons=0)
         number("threshold_error_kev", self.threshold_error_kev, low=-4.0, high=4.0, unit="keV")
         number("voltage_error_kv", self.voltage_error_kv, low=-20.0, high=20.0, unit="kV")
@@ -129,10 +129,10 @@ class SpectralSettings(StudySettings):
         for name, low in (("calibration_views", 60), ("transport_photons", 1000)):
             if 0 < getattr(self, name) < low:
                 raise ValueError(f"{name} must be 0 or at least {low}, got {getattr(self, name)}")
-        if self.mbir_realizations > self.realizations:
+        if self.mbir_realisations > self.realisations:
             raise ValueError(
-                f"mbir_realizations must lie in 0…{self.realizations} (realizations), got "
-                f"{self.mbir_realizations}"
+                f"mbir_realisations must lie in 0…{self.realisations} (realisations), got "
+                f"{self.mbir_realisations}"
             )
         levels = self.noise_levels
         if not levels or levels[0] != 0 or any(b <= a for a, b in itertools.pairwise(levels)):
@@ -174,12 +174,12 @@ def measure(
     noise_free = scan.fbp.images(scan.exact.line_integrals)[0][0]
     lines, volumes, data["rays"] = [], [], []
     pieces.ahead(*_step(s))
-    for k in range(s.realizations):
+    for k in range(s.realisations):
         volume, used, statistics = _noisy(s, pieces, k, scan)
         data["rays"].append(statistics)
         volumes.append(volume)
         lines += used
-        progress("decompose noisy scans", (k + 1) / (s.realizations + 1))
+        progress("decompose noisy scans", (k + 1) / (s.realisations + 1))
     low = pieces("noisy_low", lambda: scan.noisy(LOW_EXPOSURE_S, s.seed, _LOW_EXPOSURE_STEP)[1])
     data["rays"].append(low)
     images = Images(noise_free, torch.stack(volumes))
@@ -217,7 +217,7 @@ def plan(settings: SpectralSettings, folder: str | Path | None) -> None:
 
 
 def _step(s: SpectralSettings) -> Step:
-    return _noisy, [(k,) for k in range(s.realizations)]
+    return _noisy, [(k,) for k in range(s.realisations)]
 
 
 def _noisy(
@@ -228,7 +228,7 @@ def _noisy(
 
     def draw() -> tuple[Tensor, list[Tensor], dict[str, object]]:
         noisy, statistics = scan.noisy(s.exposure_s, s.seed + k)
-        return scan.fbp.images(noisy)[0][0], [noisy] if k < s.mbir_realizations else [], statistics
+        return scan.fbp.images(noisy)[0][0], [noisy] if k < s.mbir_realisations else [], statistics
 
     return pieces(f"noisy_{k}", draw)
 

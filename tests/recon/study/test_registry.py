@@ -131,12 +131,12 @@ BAD = {
     ],
     "bowtie": [
         ({"views": 4}, "views"),
-        ({"realizations": 1}, "realizations"),
+        ({"realisations": 1}, "realisations"),
         ({"histories": 10}, "histories"),
         ({"exposure_s": 0.0}, "exposure_s"),
         ({"map_mm": math.nan}, "map_mm"),
         ({"plaque_doses": ()}, "plaque_doses"),
-        ({"plaque_realizations": 7}, "plaque_realizations"),
+        ({"plaque_realisations": 7}, "plaque_realisations"),
         ({"detector": "film"}, "detector"),
     ],
     "hardcases": [
@@ -152,7 +152,7 @@ BAD = {
         ({"methods": ("fbp", "tv")}, "must hold fbp"),
     ],
     "noise": [
-        ({"realizations": 9}, "realizations"),
+        ({"realisations": 9}, "realisations"),
         ({"views": 4}, "views"),
         ({"doses": {"1x": 1.0}}, "two exposures"),
         ({"kernels": ("soft",), "voxels_mm": (0.2,)}, "two settings"),
@@ -180,9 +180,9 @@ BAD = {
     ],
     "spectral": [
         ({"exposure_s": 0.0}, "exposure_s"),
-        ({"realizations": 0}, "realizations"),
+        ({"realisations": 0}, "realisations"),
         ({"views": 10}, "views"),
-        ({"mbir_realizations": 9}, "mbir_realizations"),
+        ({"mbir_realisations": 9}, "mbir_realisations"),
         ({"noise_levels": (0.25, 1.0)}, "ascend from 0"),
         ({"noise_levels": (0.0, 1.0, 0.5)}, "ascend from 0"),
         ({"calibration_views": 8}, "calibration_views"),

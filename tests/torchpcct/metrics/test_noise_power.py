@@ -29,9 +29,9 @@ def coloured(shape, spacing, sigma, n, seed, sd=10.0):
     ("shape", "spacing"), [((24, 30), (0.3, 0.2)), ((8, 12, 10), (0.4, 0.25, 0.2))]
 )
 def test_filtered_white_noise(shape, spacing):
-    realizations, exact = coloured(shape, spacing, 0.25, 400, 1)
+    realisations, exact = coloured(shape, spacing, 0.25, 400, 1)
     object_ = np.linspace(-500, 500, math.prod(shape)).reshape(shape)
-    spectrum = noise_power_spectrum(torch.from_numpy(realizations + object_), spacing)
+    spectrum = noise_power_spectrum(torch.from_numpy(realisations + object_), spacing)
     assert spectrum.power.shape == shape
     strong = exact > 1e-3 * exact.max()
     ratio = spectrum.power[strong] / exact[strong]
@@ -48,13 +48,13 @@ def test_integral_is_the_unbiased_variance(n, seed, shape):
     x = np.random.default_rng(seed).normal(40, 12, (n, *shape)) + np.arange(shape[-1])
     spectrum = noise_power_spectrum(x, tuple(0.2 + 0.1 * k for k in range(len(shape))))
     assert spectrum.variance == pytest.approx(x.var(0, ddof=1).mean(), rel=1e-12)
-    assert spectrum.realizations == n
+    assert spectrum.realisations == n
     assert spectrum.power.flat[0] >= 0
 
 
 def test_radial_mean_of_an_isotropic_spectrum():
-    realizations, _ = coloured((32, 32), (0.25, 0.25), 0.3, 300, 2)
-    f, power = noise_power_spectrum(realizations, 0.25).radial()
+    realisations, _ = coloured((32, 32), (0.25, 0.25), 0.3, 300, 2)
+    f, power = noise_power_spectrum(realisations, 0.25).radial()
     expected = 100 * 0.25**2 * np.exp(-4 * (math.pi * 0.3 * f) ** 2)
     assert f[0] == 0
     assert f[-1] <= 2.0
