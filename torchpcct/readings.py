@@ -455,7 +455,7 @@ def dispersion(readings: Tensor, rows: bool) -> float:
         rows: whether the last axis but one is the detector's rows.
 
     Returns:
-        NaN if nothing can be said.
+        NaN if it cannot be determined.
     """
     found = [_dispersion(values) for values in (readings, readings.movedim(-3 if rows else -2, -1))]
     known = [f for f in found if math.isfinite(f)]

@@ -174,7 +174,7 @@ class Volume:
         Args:
             path: file or folder.
             unit: of its numbers, for files of other software, which do not say it: None: HU, and of
-                DICOM only what is said to be HU.
+                DICOM only values whose unit is given as HU.
             fill: number that takes the place of voxels that are NaN or infinite, e.g. −1000 HU
                 where they are padding about the picture; NaN: they stay as they are; None: such a
                 volume is refused.

@@ -283,7 +283,7 @@ class BackprojectionPlan:
         return apply_linear(filtered, self.forward, self.transpose)
 
     def _there(self, like: Tensor) -> tuple[Any, ...]:
-        """What :mod:`recon.analytic.backproject_triton` is told beside the data: on the device and
+        """What :mod:`recon.analytic.backproject_triton` is given beside the data: on the device and
         in the dtype of ``like``."""
         axes, center = self.grid.axes, self.grid.center
         c, s, (cy, cx) = self.cosines, self.sines, center[-2:]

@@ -566,7 +566,7 @@ def _cut_sides(
     lines: Tensor, geometry: Beam, weights: NDArray[np.float64], outside: float | None
 ) -> tuple[bool, bool]:
     """Where the rows end inside the object, as far as anything is to be done about it; a warning
-    where nobody said what lies beyond."""
+    where the exterior is not known."""
     if outside is not None and number("outside", outside, low=0.0, unit="mm⁻¹") == 0:
         return False, False
     if not lines.numel() or _transformed():

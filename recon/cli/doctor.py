@@ -256,7 +256,7 @@ _CHECKS: dict[str, Callable[[], str]] = {
 
 
 def outcomes() -> Iterator[tuple[str, bool, str]]:
-    """Name, whether it is well, and what is said, check by check."""
+    """Name, whether it is well, and what was found, check by check."""
     for name, check in _CHECKS.items():
         try:
             yield name, True, check()

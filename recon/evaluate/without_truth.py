@@ -288,7 +288,7 @@ def _lengths(sizes: Sequence[float]) -> str:
 
 
 def _note(scan: Scan, grid: VolumeGrid) -> str:
-    """What is said of FBP that was made on finer voxels."""
+    """Remark on FBP that was made on finer voxels."""
     parts = _finer(scan, grid)
     if max(parts) == 1:
         return ""
@@ -307,8 +307,8 @@ def _note(scan: Scan, grid: VolumeGrid) -> str:
 
 
 def _mean(rows: list[Comparison]) -> Comparison:
-    """Of one method on several pairs: geometric means, without those of which nothing can be
-    said."""
+    """Of one method on several pairs: geometric means, without those that could not be
+    measured."""
     sound = [r for r in rows if not r["why"]]
     if not sound:
         return rows[0]

@@ -240,7 +240,7 @@ class _Field:
 
 
 def _fingerprint(lines: Tensor) -> Hashable:
-    """What line integrals are told apart by: a hash or, of those on a device, from which nothing
+    """What line integrals are distinguished by: a hash or, of those on a device, from which nothing
     is to be copied, the sums of the bits of all views."""
     if lines.device.type == "cpu":
         return hashlib.blake2b(lines.contiguous().numpy().data).digest()

@@ -168,7 +168,7 @@ def joint_bilateral(
 
     Args:
         u: volumes.
-        guide: of the same shape, smooth enough that its differences tell of edges and not of noise.
+        guide: of the same shape, so smooth that its differences are edges and not noise.
         threshold: ``(batch,)`` differences of the guide that weigh about exp(−½) (t above).
         reach: standard deviation of s in voxels; it ends at twice that.
         step: only every so many voxels along each axis are neighbours: of smooth volumes the others

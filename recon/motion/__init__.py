@@ -11,9 +11,9 @@ as the inset does, whatever the inset looks like (the first of the consistency c
 Helgason and Ludwig). A path fitted to it does not sit in the local minimum of no motion.
 
 **What a turn holds.** A view sees the displacement across its rays, not along them. What a path
-does along the rays of every view is told by its smoothness alone: a Gaussian prior on speed and
-acceleration. How large the motion is and whether it goes to and fro along a line, the readings tell
-by their marginal likelihood (MacKay 1992, Neural Comput. 4:415), and seldom for certain: path and
+does along the rays of every view is determined by its smoothness alone: a Gaussian prior on speed
+and acceleration. How large the motion is and whether it goes to and fro along a line is estimated
+by the marginal likelihood (MacKay 1992, Neural Comput. 4:415), seldom for certain: path and
 errors are means over all sizes and directions, each as likely as the readings make it (Bayesian
 model averaging, Hoeting et al. 1999, Stat. Sci. 14:382). The one likeliest prior would take a line
 for certain and state errors along the rays that are several times too small. A constant

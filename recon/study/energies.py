@@ -76,7 +76,7 @@ def energy_rows(
     Returns:
         For each pair ``contrast`` ``[a, b]``, and the factors ``weights`` (FBP of the weighted
         bins, exact), ``limit`` (the best weights of one ray, mean over the columns that see the
-        inset), ``energies`` (the same if every counted photon told its energy), ``vmi`` (the best
+        inset), ``energies`` (the same with the energy of every photon), ``vmi`` (the best
         monochromatic image, FBP of the basis images, exact) at ``vmi_kev`` and ``vmi_limit`` (the
         best mix of the two basis images, which is no image at one energy).
 

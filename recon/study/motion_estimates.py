@@ -71,7 +71,7 @@ class JumpMotion(SinusoidalMotion):
     """All of the displacement at once.
 
     Args:
-        at_s: when, after half a turn of 0.35 s if nothing else is said.
+        at_s: when, after half a turn of 0.35 s by default.
     """
 
     at_s: float = 0.5 * paper.ROTATION_S
@@ -122,7 +122,7 @@ def estimated_paths(
         mean), ``error_mm`` (of what is applied), ``stated_mm`` (of the standard errors), ``inside``
         (share within two of them), ``refused``, ``held``, ``jumps`` and ``warned`` (in how many
         realisations no path was found as it leads too far, a motion was applied, a jump was
-        found, a warning said that something else moves). None where two vessels have no common
+        found, a warning reported that something else moves). None where two vessels have no common
         path, or all are refused.
     """
     jobs = [

@@ -88,7 +88,7 @@ class PlaqueReading:
             certain. From :data:`CERTAIN` on both are read: one (that at the point) as the core, the
             other's shape is held where it was found, its figure is the ``second contrast``,
             ``info["second_core"]`` tells its place and mm³.
-        third_core: what is said of one more that the data show after that: ``at_mm``,
+        third_core: one more that the data show after that: ``at_mm``,
             ``volume_mm3``, ``contrast_hu``.
         calcifications: number of calcified bodies.
         figures: name → :class:`recon.vessel.figures.TissueEstimate`; the core's are missing where

@@ -63,7 +63,7 @@ _lock = threading.Lock()
 
 def fingerprint(*arguments: object) -> str | None:
     """Names what readings are computed from, and the code that computes them; None where that
-    cannot be told (a shape or material of the user's own that cannot be pickled)."""
+    cannot be computed (a shape or material of the user's own that cannot be pickled)."""
     try:
         content = pickle.dumps(arguments, protocol=4)
     except Exception:  # whatever the user's own class raises

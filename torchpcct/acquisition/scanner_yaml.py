@@ -1,6 +1,6 @@
 """A scanner of one's own as YAML: geometry, tube, detector, filters, bowtie.
 
-A scanner with what may be said of it::
+A scanner with all its keys::
 
     name: bench                 # optional
     geometry:                   # of torchpcct.formats.geometry_yaml, kind cone; one turn of views

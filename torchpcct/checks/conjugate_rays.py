@@ -69,7 +69,7 @@ STEP_TOLERANCE = 0.001
 """Relative error of the steps between views that is no finding: what mechanics leave."""
 FALSE_ALARMS = 0.0005
 """Share of scans with an error of :data:`CENTRE_TOLERANCE` that are taken for wrong; of faultless
-ones it is less. None of 500 sound scans should be told anything."""
+ones it is less. None of 500 sound scans should give a finding."""
 _COLUMNS = (5, 25)
 """Columns over which the slope is smoothed: a few for small errors, many for those of several
 columns."""
@@ -145,7 +145,7 @@ def geometry_test(
         difference over that of what changes from view to view, noise taken off, 0 of a sound scan,
         1 of rays that have nothing to do with each other.
         Of several causes the one that explains most is named, and its size measured again where
-        nothing is left of it; the others' are of first order. What is said after ± is twice the
+        nothing is left of it; the others' are of first order. The figure after ± is twice the
         standard error: 95 % of such errors lie within.
 
     Raises:
@@ -159,7 +159,7 @@ def geometry_test(
         {k: v for k, v in values.items() if k == "centre"}
         for values in (centre.sizes, centre.errors)
     )
-    # What is found: how much of the difference it explains, its cause, and what is said of a cause
+    # What is found: how much of the difference it explains, its cause, and the text of a cause
     # without a size.
     ranked = [
         (explained / pairs.here.numel(), "centre" if "rotation centre" in text else "", text)
@@ -322,7 +322,7 @@ def _roll_text(size: float, error: float) -> str:
 
 
 _TEXTS = {"centre": _centre_text, "scale": _scale_text, "step": _step_text, "roll": _roll_text}
-"""What is said of each error of a geometry."""
+"""Text of each error of a geometry."""
 
 
 def _mismatch_text(mismatch: float, strangers: bool, mirrored: bool) -> str:
@@ -547,7 +547,7 @@ def _swing(score: Floats, bent: Floats, waves: Floats, parted: float) -> tuple[f
     scale = np.abs(waves[:, :1]).mean()
     design, y = waves / scale, score / scale
     if np.linalg.cond(design) > 20.0:
-        return math.nan, 1.0  # a part of the turn: the wave is not told from the constant
+        return math.nan, 1.0  # a part of the turn: the wave is not distinguished from the constant
     inverse = np.linalg.inv(design.T @ design)
     found, left = (inverse @ (design.T @ values) for values in (y, 0.5 * bent / scale))
     count = y.size - 3

@@ -128,7 +128,7 @@ def clipped_floor(counts: Floats, quantum: float) -> Floor:
 
 def folded_share(counts: Floats) -> float:
     """Share of the readings that lie close above 0 while none lies below: negative ones were made
-    positive; 0 where that is not so, or cannot be told.
+    positive; 0 where that is not so, or cannot be determined.
 
     Args:
         counts: ``(views, rows, columns)`` in any unit, NaN where dead.
@@ -235,7 +235,7 @@ def _photon(x: Floats) -> float:
     """Signal of a photon, by how the variance along the last axis grows with the reading where
     nothing is clipped (photon transfer, Janesick 2007); what the electronics add does not grow.
 
-    Infinite where that cannot be told.
+    Infinite where that cannot be determined.
     """
     second, mean = second_differences(x)
     known = np.isfinite(second)

@@ -69,11 +69,11 @@ added, more, where electronics add noise."""
 _SURE = 6.0
 """χ² by which something else must fit better than photons without any change."""
 _COUNTED = 4.3
-"""Photons below which single ones are told in the readings."""
+"""Photons below which single ones are resolved in the readings."""
 _SEVERAL = 0.5
 """Standard deviation of these readings, in photons, from which there are several of them."""
-_TOLD = 0.5
-"""Mean cosine of readings between whole photons from which they are told."""
+_RESOLVED = 0.5
+"""Mean cosine of readings between whole photons from which they are resolved."""
 _SINGLE = 2.0
 """Photons that a tenth of them does not exceed."""
 _CLEARLY = 0.2
@@ -99,7 +99,7 @@ class _Made(NamedTuple):
 
 def logarithm_error(scan: Scan) -> tuple[Tensor, bool] | None:
     """Mean error of a scan's line integrals that follows from their logarithms being those of few
-    photons, as far as it can be told.
+    photons, as far as it can be determined.
 
     Args:
         scan: noisy, without window and energy bins.
@@ -163,7 +163,7 @@ def _mean_around(values: Tensor, scan: Scan) -> Floats:
 
 def _made(y: Floats) -> _Made | None:
     """How logarithms were made, by the noise of ``y = exp(-p)``, ``(views, rows, columns)``; None:
-    of so many photons that it does not matter, or it cannot be told."""
+    of so many photons that it does not matter, or it cannot be determined."""
     groups = np.array_split(np.arange(y.shape[-1]), max(1, min(_GROUPS, y.shape[-1] // 8)))
     classes = [_transfer(y[..., columns]) for columns in groups]
     if not all(level.size for level, _, _ in classes):
@@ -173,7 +173,7 @@ def _made(y: Floats) -> _Made | None:
     clearest = max(counted, key=lambda k: counted[k][0])
     alike = (-0.5,) if clearest == -0.5 else (-1.0, 0.0)
     unlike = max(score for k, (score, _) in counted.items() if k not in alike)
-    if counted[clearest][0] > max(_TOLD, unlike + _CLEARLY):  # 0 or 1 were added, or a half
+    if counted[clearest][0] > max(_RESOLVED, unlike + _CLEARLY):  # 0 or 1 were added, or a half
         fits = {k: (counted[k][1], _misfit(classes, counted[k][1], k)) for k in alike}
     beyond = min(fits, key=lambda k: fits[k][1])
     others = [fit[1] for k, fit in fits.items() if k * beyond <= 0.0 and k != beyond]

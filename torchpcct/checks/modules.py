@@ -58,7 +58,7 @@ over the width of coarse cells, and a module has :data:`_LEAST`."""
 _LEAST = 4
 """Columns of the narrowest module, and the fewest beside it."""
 _MOST = 128
-"""Groups of columns of a side that are told apart."""
+"""Groups of columns of a side that are distinguished."""
 
 
 def module_test(pairs: RayPairs) -> ScanTest:

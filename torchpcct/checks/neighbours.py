@@ -3,7 +3,7 @@ without conjugate rays.
 
 From view to view an object turns by one step. Means of a view under windows that are wide against
 the way of a point in one step are smooth functions of the angle, whatever the object: their change
-over a pair of views is foretold by the changes before and behind it. What is left over,
+over a pair of views is predicted by the changes before and behind it. What is left over,
 
     d(v) = x(v + 1) − x(v) − a x′,    x′ from the pairs v ± 1 and v ± 2 alone,
 
@@ -89,7 +89,7 @@ _SCATTER_SIGMAS = 5.0
 _LIKE_THE_CHANGE = (0.6, 1.6)
 """Size of a residual, over that of the change, from and up to which it looks like it."""
 _CLEAR = 0.5
-"""Squared change over its noise below which nothing is said. Edges leave up to 0.23 in sound
+"""Squared change over its noise below which nothing is reported. Edges leave up to 0.23 in sound
 scans."""
 _STEPS_A_RESIDUAL = math.sqrt(7.0) / MEDIAN_TO_SD
 """Median size of the residual of angles that scatter independently by one step (normal, rms)."""
@@ -258,7 +258,7 @@ class _Views:
         return int(np.clip(math.ceil(_WINDOW_STEPS * self.way), _LEAST_WINDOW, self.g.columns // 2))
 
     def order(self) -> tuple[float, float, bool]:
-        """Von Neumann's ratio of the slowest means, its limit, and whether it can be told."""
+        """Von Neumann's ratio of the slowest means, its limit, and whether it can be determined."""
         slow = 1.0 - math.cos(min(_SLOW_HARMONICS * self.step, math.pi))
         limit = 3.0 * slow + 0.2
         if limit > 0.8:
@@ -312,18 +312,18 @@ class _Views:
         rate = [c / a[:, None] for c in change]
         # The rate at the pair from two pairs before and two behind it: exact for a cubic function
         # of the angle.
-        foretold = [
+        predicted = [
             ((r[1:-3] + r[3:-1]) * (4.0 / 6.0) - (r[:-4] + r[4:]) / 6.0) * a[2:-2, None]
             for r in rate
         ]
-        left = [c[2:-2] - f for c, f in zip(change, foretold, strict=True)]
+        left = [c[2:-2] - f for c, f in zip(change, predicted, strict=True)]
         turning = [(r[3:-1] - r[1:-3]) * a[2:-2, None] for r in rate]
         # Few columns sample a sharp edge differently: one set may turn about, the other not.
         kink = np.maximum((turning[0] * turning[1]).sum(1), 0.0)
         aliased = 0.5 * np.square(turning[0] - turning[1]).sum(1)
         kink += 0.5 * np.maximum(aliased - _beside(aliased, self.closes), 0.0)
         steady = np.all([a[k : k + pairs] < _STEADY * self.step for k in range(5)], axis=0)
-        square, usual = ((x[0] * x[1]).sum(1) for x in (left, foretold))
+        square, usual = ((x[0] * x[1]).sum(1) for x in (left, predicted))
         near = np.maximum(_beside(square, self.closes), 0.0)
         # The noise of these sums, from what the sets differ by there and beside it; windows overlap
         # by half.
@@ -335,9 +335,9 @@ class _Views:
         scale = max(float(np.median(usual)), float(np.mean(usual)) / 4.0)
         if scale <= 3.0 * float(np.median(noisy)) / math.sqrt(pairs):
             return None
-        scatter = self._scatter(left, foretold) if scale > _CLEAR * float(apart.mean()) else None
+        scatter = self._scatter(left, predicted) if scale > _CLEAR * float(apart.mean()) else None
         steps = np.sqrt(np.maximum(square, 0.0) / scale)
-        along = (left[0] * foretold[1] + left[1] * foretold[0]).sum(1) / 2.0
+        along = (left[0] * predicted[1] + left[1] * predicted[0]).sum(1) / 2.0
         seen = usual > 0.05 * scale
         shift = np.where(seen, along / np.where(seen, usual, 1.0), 0.0)
         # No step forward, or many: a step back is none of a gantry.
@@ -380,15 +380,15 @@ class _Views:
         text = self._jump_text(at, int(first[most]), size, sigmas, explained)
         return _Jumps(float(steps[most]), error, (text,), scatter)
 
-    def _scatter(self, left: list[Floats], foretold: list[Floats]) -> tuple[float, float, str]:
+    def _scatter(self, left: list[Floats], predicted: list[Floats]) -> tuple[float, float, str]:
         """Of the angles about the described ones in steps, rms: what the residuals of all pairs
         have of the change.
 
         Products of the two sets are squares without noise; the median passes over edges.
         """
-        square, usual = ((x[0] * x[1]).sum(1) for x in (left, foretold))
+        square, usual = ((x[0] * x[1]).sum(1) for x in (left, predicted))
         clear = usual > 0.3 * float(np.median(usual))
-        one, other = ((left[k] * foretold[1 - k]).sum(1)[clear] / usual[clear] for k in range(2))
+        one, other = ((left[k] * predicted[1 - k]).sum(1)[clear] / usual[clear] for k in range(2))
         products = one * other
         n, median = products.size, float(np.median(products))
         error = (

@@ -55,8 +55,8 @@ _BASE_GROUPS = 8
 _BASE_CLASSES = 12
 """Classes of line integrals in each."""
 _BASE_RANGE = 0.3
-"""Range of line integrals over which the growth of the noise can be told; in 80 sound scans with
-0.8 and more it was exp(1.4 p) at most."""
+"""Range of line integrals over which the growth of the noise can be measured; in 80 sound scans
+with 0.8 and more it was exp(1.4 p) at most."""
 _BASE_SIGMAS = 3.0
 """Standard errors to which it must be known."""
 _BASE_OFF = 0.3

@@ -51,7 +51,7 @@ are degrees."""
 
 
 class Frames(NamedTuple):
-    """What a file of a parallel beam holds, and what was said of it.
+    """What a file of a parallel beam holds, and what the arguments add.
 
     Attributes:
         path: of the file.

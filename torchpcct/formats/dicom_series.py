@@ -331,7 +331,7 @@ def _hounsfield(d: pydicom.Dataset, unit: str | None, ours: bool) -> tuple[Float
     """Float32 pixels of an image in HU, and how many of them are padding.
 
     Raises:
-        ValueError: numbers that are not said to be HU.
+        ValueError: numbers whose unit is not given as HU.
     """
     if unit is None:
         _check_ct(d)

@@ -125,7 +125,7 @@ def noise_at_equal_resolution(
 
     Raises:
         ValueError: volumes of other shapes or too small; constant volumes, or two that are the
-            same, of which nothing can be said; a region of fewer than two voxels.
+            same, of which nothing can be measured; a region of fewer than two voxels.
     """
     pairs = [
         [np.asarray(v.numpy(), dtype=np.float64) for v in (p.first, p.second)]

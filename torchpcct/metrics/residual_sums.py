@@ -107,7 +107,7 @@ def readings(residual: Tensor, weights: Tensor, fitted: Tensor) -> Readings:
 
 
 WRONG_WEIGHTS = "weights must be 0 or more, and some greater than 0: give inverse variances"
-"""What is said of weights that tell nothing."""
+"""Message on weights that determine nothing."""
 
 
 def level_weights(w: Tensor, lines: Tensor) -> Tensor:

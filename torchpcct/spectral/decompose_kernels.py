@@ -109,7 +109,7 @@ def _newton(
     """Score, Fisher information and the (observed, if positive definite) information that scales
     the step."""
     f11, f12, f22 = _information(m)
-    # Where all detected photons have nearly one energy, the two materials cannot be told apart.
+    # Where all detected photons have nearly one energy, the two materials cannot be distinguished.
     det = max(f11 * f22 - f12 * f12, 1e-13 * f11 * f22)
     g11, g12, g22 = f22 / det, -f12 / det, f11 / det
     u1 = u2 = o11 = o12 = o22 = 0.0

@@ -93,7 +93,7 @@ def mmd(
     triplets = [t for t in triplets if _area(corners[:, t]) > 1e-9 * scale]
     if not scale > 1e-12 * float((corners**2).sum()):
         raise ValueError(
-            "the tissues lie on one line of the basis plane: three fractions cannot be told apart"
+            "the tissues lie on one line of the basis plane: three fractions are not determined"
         )
     best = torch.full((x.shape[1],), torch.inf, dtype=torch.float64)
     fractions = torch.zeros((count, x.shape[1]), dtype=torch.float64)

@@ -60,7 +60,7 @@ class Tissue(IntEnum):
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """Distribution of the scenes: ranges in mm or HU, uniform unless said otherwise, and
+    """Distribution of the scenes: ranges in mm or HU, uniform unless stated otherwise, and
     probabilities.
 
     Args:
