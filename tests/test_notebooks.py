@@ -284,7 +284,7 @@ def test_a_full_run_is_a_full_run(tmp_path):
         ([written["stored"]], 0, "stored.ipynb: "),
     ):
         command = [sys.executable, FOLDER / "execute.py", *words]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=1200, check=False)
         assert done.returncode == status, done.stderr
         assert said in done.stderr
         assert "switch.ipynb: " in done.stderr or status == 0

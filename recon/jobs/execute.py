@@ -223,15 +223,18 @@ class Processes(ThreadPoolExecutor):
             )
             self._own.pool = pool
             self._pools.append(pool)
+        children: list[BaseProcess] = []
         try:
             # a process starts when it is first given something
             with self._starting, _without_current_folder():
                 if self._ended:
                     raise BrokenExecutor("ended")
                 job = pool.submit(fn, *args)
+                children = _children(pool)
             return job.result()
-        except BrokenExecutor:
+        except BrokenExecutor as error:
             self._own.pool = None
+            error.add_note(_how_it_ended(children))  # for the report of the run
             raise
 
     def __exit__(
@@ -251,11 +254,7 @@ class Processes(ThreadPoolExecutor):
         with self._starting:
             self._ended = True
         super().shutdown(wait=False, cancel_futures=True)
-        children = [
-            p
-            for pool in self._pools
-            for p in list((getattr(pool, "_processes", None) or {}).values())
-        ]
+        children = [p for pool in self._pools for p in _children(pool)]
         for child in children:
             child.terminate()
         until = time.monotonic() + _LAST_S
@@ -269,6 +268,25 @@ class Processes(ThreadPoolExecutor):
         super().shutdown(wait, cancel_futures=cancel_futures)
         for pool in self._pools:
             pool.shutdown(wait, cancel_futures=cancel_futures)
+
+
+def _children(pool: Pool) -> list[BaseProcess]:
+    """Its processes, of which the library says nothing in public."""
+    return list((getattr(pool, "_processes", None) or {}).values())
+
+
+def _how_it_ended(children: Sequence[BaseProcess]) -> str:
+    """Signal or status by which a process of :class:`Processes` ended; empty: it is not known."""
+    for child in children:
+        child.join(_LAST_S)  # it is known when the system has handed it over
+        code = child.exitcode or 0
+        if code > 0:
+            return f"status {code}"
+        if code == -getattr(signal, "SIGKILL", 9):
+            return "SIGKILL: somebody's, or the system's where memory is short"
+        if code < 0:
+            return next((s.name for s in signal.Signals if s == -code), f"signal {-code}")
+    return ""
 
 
 def _load(module: str) -> None:
@@ -822,7 +840,8 @@ def _keep(folder: Path, files: dict[str, bytes]) -> None:
 def _death(error: Exception, executor: Executor) -> str:
     """What to say of a job whose worker died; any other error is raised."""
     if isinstance(error, BrokenExecutor) and isinstance(executor, Processes):
-        return "its process died"
+        how = "; ".join(filter(None, getattr(error, "__notes__", ())))
+        return f"its process died ({how})" if how else "its process died"
     if type(error).__name__ == "KilledWorker":  # of Dask, which has repeated it
         return "KilledWorker: every worker that took it died"
     raise error

@@ -70,7 +70,7 @@ def found_in(folder, module):
 
 @njit(cache=True)
 def _kernel(x):
-    return x.reshape(2, -1).sum(axis=1).max() + x.mean() + x[::-1].copy().argmax()
+    return x.sum()  # compiled in less time than a worker waits for another, on a busy machine, too
 
 
 def compiles(folder, name, together):

@@ -64,7 +64,7 @@ def test_killed_run_resumed(tmp_path, uninterrupted):
     out = tmp_path / "x"
     process = script(tiny_training.__file__, "slow", str(out))
     try:
-        log, deadline = out / "log.csv", time.monotonic() + 120
+        log, deadline = out / "log.csv", time.monotonic() + 600
         while not (log.exists() and len(log.read_text().splitlines()) > 7):
             assert process.poll() is None
             assert time.monotonic() < deadline

@@ -349,7 +349,8 @@ def test_a_job_whose_process_dies_is_repeated_and_left_out_after_three(
     processes.log = tmp_path / "run.log"
     with pytest.raises(
         LeftOut,
-        match=r"2 of 11 jobs are missing: always \(its process died\); needs it \(needs alw",
+        match=r"2 of 11 jobs are missing: always \(its process died \(SIGKILL: .*\)\); needs it "
+        r"\(needs alw",
     ):
         run(jobs, tmp_path, processes)
     assert (tmp_path / "once.txt").exists()
@@ -447,7 +448,7 @@ def test_a_signal_ends_the_processes_and_takes_back_what_is_half_written(tmp_pat
     )
 
 
-def wait_until(condition, seconds=120.0):
+def wait_until(condition, seconds=600.0):
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end
@@ -483,15 +484,15 @@ def test_a_signal_ends_evaluate(tmp_path, name):
         text=True,
         env={**os.environ, "PYTHONPATH": path},
     ) as process:
-        wait_until(lambda: list(tmp_path.glob("out/pieces/**/*.h5")), 300.0)
+        wait_until(lambda: list(tmp_path.glob("out/pieces/**/*.h5")))
         children = psutil.Process(process.pid).children(recursive=True)
         process.send_signal(number)
-        said = process.communicate(timeout=60)[1]
+        said = process.communicate(timeout=600)[1]
     assert process.returncode == 128 + number
     assert said.splitlines()[-1] == f"torchpcct evaluate: ended by {name}, nothing half written"
     assert "Traceback" not in said
     assert children
-    assert not psutil.wait_procs(children, 10.0)[1]
+    assert not psutil.wait_procs(children, 100.0)[1]
     assert not [p for p in tmp_path.rglob("*.part.*")]
 
 
