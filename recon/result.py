@@ -20,6 +20,9 @@ _LOG = logging.getLogger(__name__)
 RESIDUAL_TEST = "the test of what the volume leaves of the readings"
 """Name of :mod:`torchpcct.metrics.residual_test` in messages."""
 
+BEYOND_TEST = "the search for what lies beyond the grid"
+"""Name of :mod:`recon.least_squares.beyond_grid` in messages."""
+
 T = TypeVar("T")
 
 

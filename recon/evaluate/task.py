@@ -19,6 +19,7 @@ start from.
 from __future__ import annotations
 
 import hashlib
+import logging
 import math
 import re
 from collections.abc import Mapping
@@ -36,9 +37,10 @@ from torch import Tensor
 from recon.analytic.exact_noise import line_integral_variance
 from recon.jobs.sources import source_digest
 from recon.jobs.store import Store
+from recon.least_squares.beyond_grid import beyond_grid
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.acquisition.path_lengths import tissue_path_lengths
-from torchpcct.detector_window import DetectorWindow
+from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.cramer_rao import cramer_rao_bound, information_matrix
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
@@ -95,6 +97,9 @@ _VIEWS = 246
 """Views that values and limit are summed over: path lengths change slowly from view to view."""
 _SUB_RAYS = 16
 """Beam samples of those views."""
+
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -251,6 +256,8 @@ class Task:
                     f"task {self.name}: {error} (outside of the inset a task's scene must be "
                     "round about the axis)"
                 ) from error
+            for text in _beyond(made, self.grid):
+                log.warning("task %s: %s", self.name, text)
             store.keep_scan(made, path)
         return Scan.load(path)
 
@@ -577,3 +584,11 @@ def _nearest(mask: Bools, point: Sequence[float | np.integer], count: int) -> ND
     out = np.zeros(mask.shape, bool)
     out[tuple(at[order].T)] = True
     return out
+
+
+def _beyond(scan: Scan, grid: VolumeGrid) -> list[str]:
+    """What of a scan lies beyond its inset (:mod:`recon.least_squares.beyond_grid`)."""
+    if scan.counts.ndim != 3 or scan.electronic_noise:  # the iterative methods take no such scan
+        return []
+    seen = footprint(scan.geometry, grid, margin=1)
+    return beyond_grid(scan, grid, seen, scan.exterior_line_integrals())

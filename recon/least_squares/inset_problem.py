@@ -17,12 +17,13 @@ from recon.analytic.coverage import check_rows
 from recon.analytic.inset import require_inside, require_same_exterior, static_fbp
 from recon.data_term import Projected, Quadratic
 from recon.gram.gram import Gram
+from recon.least_squares.beyond_grid import beyond_grid
 from recon.least_squares.exterior import UnknownExterior, length_unit
 from recon.least_squares.field_model import FieldModel
 from recon.least_squares.memory import require_memory
 from recon.least_squares.pwls import MinimiseOptions, PwlsOptions, data_model, minimise
 from recon.least_squares.qggmrf import DEFAULT_PRIOR, QGGMRF
-from recon.result import RESIDUAL_TEST, Result, tested
+from recon.result import BEYOND_TEST, RESIDUAL_TEST, Result, tested
 from torchpcct.detector_window import DetectorWindow, footprint
 from torchpcct.devices import require_device
 from torchpcct.geometry import ConeBeam, VolumeGrid
@@ -30,6 +31,7 @@ from torchpcct.projector import Projector
 from torchpcct.scan import NOISE_FREE_EXPOSURE_S, Scan
 from torchpcct.scan_memory import once
 from torchpcct.switches import undisturbed
+from torchpcct.vector_geometry import check_motion
 
 __all__ = ["InsetProblem"]
 
@@ -225,6 +227,22 @@ class InsetProblem:
             lines = self.outer.crop(lines, self.window)
         return self.window.less(lines, self._background)
 
+    def beyond(self, scan: Scan) -> list[str]:
+        """Warnings of what lies beyond the grid of a scan with a known exterior
+        (:mod:`recon.least_squares.beyond_grid`); of others none, since it belongs to the exterior
+        that is found."""
+        if self._background is None:
+            return []
+        background = self._background
+        path = None if self.motion is None else check_motion(self.motion, scan.geometry.views, 3)
+        return once(
+            scan,
+            "beyond",
+            lambda: beyond_grid(scan, self.grid, self.window, background, path),
+            self.grid,
+            self.window,
+        )
+
     @undisturbed
     def term(self, scan: Scan, data: Tensor | None = None) -> Quadratic:
         """What solvers need of a scan, with the weights of its exposure (noise free: of 1 s): a
@@ -340,6 +358,8 @@ class InsetProblem:
         found, report = self.solve(term, prior, **options)
         for scan, (lines, _), values in zip(scans, given, found.to(torch.float32), strict=True):
             warnings: list[str] = []
+            for texts in tested(BEYOND_TEST, warnings, self.beyond, scan):
+                warnings += texts
             tests = (
                 []
                 if scan.noise_free

@@ -12,7 +12,7 @@ from torch import Tensor
 from recon.data_term import Quadratic
 from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.mbir import Mbir, average_onto, working_grid
-from recon.result import RESIDUAL_TEST, Result, tested
+from recon.result import BEYOND_TEST, RESIDUAL_TEST, Result, tested
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.scan_memory import once
@@ -78,6 +78,8 @@ class Inset:
                 *network.check(report["noise_scale_hu"], peak, scan.unit, problem.mu_ref),
                 *self._missing(report["missing_body"]),
             ]
+            for texts in tested(BEYOND_TEST, warnings, problem.beyond, scan):
+                warnings += texts
             tests = []
             if not scan.noise_free:
                 report["notes"] = network.notes(report["noise_scale_hu"][0])

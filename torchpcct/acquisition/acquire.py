@@ -98,7 +98,10 @@ def acquire(
         seed: realisation of the noise, ≥ 0. A reading's noise depends on the seed and its place
             alone.
         region: keep only the readings around this grid's footprint (the rest of the detector then
-            reads the rotationally symmetric bodies, noise free). All other bodies must lie inside.
+            reads the rotationally symmetric bodies, noise free), in all rows. All other bodies must
+            lie inside as they are seen along z. They may go on beyond its slices: FBP of any slices
+            is right, PWLS and MBIR need a grid whose slices hold them, and warn of one whose do
+            not.
         rotation_s: time of one turn in s, for moving scenes; None: ``exposure_s``.
         duty: share of each view's time with the beam on: 1 continuous, → 0 pulsed (no blur by the
             gantry's turn).

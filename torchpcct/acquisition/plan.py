@@ -145,6 +145,10 @@ def active_window(geometry: ConeBeam, bodies: Bodies) -> DetectorWindow:
 def _kept_window(geometry: ConeBeam, region: VolumeGrid, bodies: Bodies) -> DetectorWindow:
     """The readings around the footprint of ``region``, every row; it must hold all bodies that
     vary."""
+    if region.ndim != 3:
+        raise ValueError(
+            f"region must be a (z, y, x) grid of three numbers each, got the shape {region.shape}"
+        )
     kept = footprint(geometry, region, margin=NOISE_MARGIN_COLUMNS).with_rows(0, geometry.rows)
     if bodies.varying:
         # Without the four columns for the beam's width.
@@ -262,8 +266,8 @@ def make_plan(
         sub_ray_count: force a number of sub-rays instead of choosing it.
 
     Raises:
-        ValueError: bodies that vary outside ``region``, a region outside the field of view; a
-            tolerance below 0 or NaN.
+        ValueError: bodies that vary outside ``region``, a region outside the field of view or of
+            two dimensions; a tolerance below 0 or NaN.
         TypeError: a tolerance that is no number.
     """
     number("tolerance_hu", tolerance_hu, low=0.0, unit="HU")

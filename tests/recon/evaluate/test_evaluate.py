@@ -307,6 +307,15 @@ def test_bad_tasks_are_named(tmp_path, folder, changes, expected_text):
         assert read_task(path).regions
 
 
+@pytest.mark.parametrize(("height", "said"), [(6, False), (1.2, True)])
+def test_a_signal_that_the_inset_cuts_is_named(tmp_path, caplog, height, said):
+    """Its iterative methods place a part of what goes on beyond the inset into the end slices."""
+    path = tmp_path / "cut.yaml"
+    path.write_text(INSERT.replace("size: [6, 8, 8]", f"size: [{height}, 8, 8]"), encoding="utf-8")
+    read_task(path).scan(Store(tmp_path / "kept"), "present")
+    assert ("task cut: what differs from the exterior goes on" in caplog.text) == said
+
+
 def test_names_that_are_paths_stay_within(task, tmp_path):
     """A file's name makes a task's, whatever it is; a method's never leaves the folder of the
     task."""

@@ -298,6 +298,7 @@ def test_refusals_come_early(plaque):
         ("sub-rays", lambda: scan(sub_rays=5)),
         ("sub-rays", lambda: sub_rays(7)),
         ("region", lambda: scan(region=VolumeGrid((4, 4, 4), 0.2, (0, 0, 60.0)))),
+        ("three numbers", lambda: scan(region=VolumeGrid((45, 45), 0.2, INSET.center[1:]))),
         ("field of view|orbit", lambda: scan(region=VolumeGrid((4, 4, 4), 0.2, (0, 0, 500.0)))),
         ("rotation_s", lambda: scan(plaque_scene(motion_amplitude=2.0)[0])),
     )
