@@ -136,17 +136,22 @@ class EnergyRealisations(Realisations):
         """See :attr:`Realisations.key`."""
         return f"{super().key} {source_digest(__name__)}"
 
-    @cached_property
-    def bins(self) -> tuple[Scan, Scan]:
-        """Noise-free scans in energy bins, with and without the signal."""
+    def _in_bins(self, signal: str) -> Scan:
+        """Noise-free scan in energy bins with the signal ``"present"`` or ``"absent"``."""
         task = replace(self.task, scanner=self.scanner)
-        return task.scans(Store(self.store.folder / BINS))
+        return task.scan(Store(self.store.folder / BINS), signal)
+
+    @cached_property
+    def bins(self) -> Scan:
+        """Noise-free scan in energy bins, with the signal."""
+        return self._in_bins("present")
 
     @cached_property
     def clean(self) -> tuple[Scan, Scan]:
         """See :attr:`Realisations.clean`."""
-        present, absent = (scan.weighted(self.weights) for scan in self.bins)
-        return present, absent
+        # Of the scan without the signal no bins are kept: they take as much memory as those with
+        # it, and realisations need the latter alone.
+        return self.bins.weighted(self.weights), self._in_bins("absent").weighted(self.weights)
 
     def _ground_truth(self) -> GroundTruth:
         return self.task.ground_truth_of(*self.clean)
@@ -154,7 +159,7 @@ class EnergyRealisations(Realisations):
     def pair(self, exposure_s: float, k: int) -> tuple[Simulated, Simulated]:
         """See :meth:`Realisations.pair`: the same photons, each in its bin."""
         summed = self.base.pair(exposure_s, k)[0].scan
-        clean, bins = self.clean[0], self.bins[0]
+        clean, bins = self.clean[0], self.bins
         counts = split(summed.counts, bins.counts, summed._first_index(), int(summed.seed or 0))
         readings = weighted_sum(bins, counts, np.asarray(self.weights))
         scale = exposure_s / NOISE_FREE_EXPOSURE_S

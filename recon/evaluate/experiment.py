@@ -14,7 +14,7 @@ import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -297,7 +297,9 @@ def _jobs(
                     if k
                     else known
                 )
-                seconds, kb = _estimate(task, [m for m in group if m.name in asked], max(len(k), 1))
+                seconds, mib, kept_bytes = _estimate(
+                    task, [m for m in group if m.name in asked], max(len(k), 1)
+                )
                 jobs.append(
                     Job(
                         name,
@@ -306,8 +308,8 @@ def _jobs(
                         (*pieces, f"{place}*sigma_*.npz", f"{place}energies_*.npz"),
                         (first, *in_bins, known) if k else (first, *in_bins),
                         seconds=seconds,
-                        mib=_MIB,
-                        bytes=kb,
+                        mib=mib,
+                        bytes=kept_bytes,
                     )
                 )
     if not weighted:
@@ -330,23 +332,28 @@ def _parts(method: Method, k: range) -> tuple[str, ...]:
     return ("clean",) if method.network is None else ("clean", "response")
 
 
-_SECONDS = {"fbp": 0.0, "pwls": 0.5, "mbir": 0.8}
+_SECONDS = {"fbp": 0.0, "pwls": 1.0, "mbir": 1.0}
 """Seconds of a volume of 10⁵ voxels on one core, by method."""
 _OTHER_S = 0.2
 """The same of a filter or another function."""
 _DRAW_S = 2.0
 """Seconds of a noisy scan and its twin with FBP of them (1968 views)."""
+_DRAW_IN_BINS_S = 22.0
+"""The same of scans whose counts are split among eight energy bins."""
 _MIB = 2600.0
 """Memory of a process, MiB."""
+_MIB_IN_BINS = 6500.0
+"""The same where counts are split among energy bins."""
 
 
-def _estimate(task: Task, methods: Sequence[Method], n: int) -> tuple[float, float]:
-    """Rough seconds of realisations on one core, and bytes that are kept."""
+def _estimate(task: Task, methods: Sequence[Method], n: int) -> tuple[float, float, float]:
+    """Rough seconds of realisations on one core, memory in MiB, and bytes that are kept."""
     volumes = 2 * n * task.grid.voxels / 1e5
     seconds = volumes * sum(_SECONDS.get(m.name.partition(":")[0], _OTHER_S) for m in methods)
-    return seconds + n * _DRAW_S, len(methods) * (
-        2.0 * task.grid.voxels + 8e3 * n * (3 + len(task.names))
-    )
+    in_bins = len({m.energies for m in methods} - {None})
+    seconds += n * (_DRAW_S + in_bins * _DRAW_IN_BINS_S)
+    kept = len(methods) * (2.0 * task.grid.voxels + 8e3 * n * (3 + len(task.names)))
+    return seconds, _MIB_IN_BINS if in_bins else _MIB, kept
 
 
 def _kernels(methods: Sequence[Method], energies: str | None, exact: bool = True) -> list[str]:
@@ -411,7 +418,8 @@ class _Bench:
         """Pieces of methods at an exposure: of a block of realisations, or of none what is
         without noise."""
         pairs = self._pairs(exposure, k)
-        for name in names:
+        # Methods of one option ``energies`` follow each other: their realisations are in memory.
+        for name in sorted(names, key=lambda name: self.methods[name].energies or ""):
             measurement = self.measurement(name, exposure)
             if k:
                 measurement.block(k, partial(pairs, self.methods[name].energies))
@@ -435,9 +443,11 @@ class _Bench:
     def _pairs(
         self, exposure: float, k: range
     ) -> Callable[[str | None], list[tuple[Simulated, Simulated]]]:
-        """Realisations for an option ``energies``, drawn once for all methods, if one needs
-        them."""
-        return cache(lambda energies: [self.realisations_of(energies).pair(exposure, i) for i in k])
+        """Realisations for an option ``energies``, drawn if a method needs them; those of the
+        option asked for last are kept."""
+        return lru_cache(maxsize=1)(
+            lambda energies: [self.realisations_of(energies).pair(exposure, i) for i in k]
+        )
 
     def contrasts(self, energies: str | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """True contrasts of the ROIs: what the signal adds, and what there is without it, HU."""
