@@ -45,7 +45,8 @@ def unswitched() -> AbstractContextManager[object]:
         numpy_as_ever
         and torch.get_default_dtype() is torch.float32
         and torch.get_default_device().type == "cpu"
-        and not any(torch.is_autocast_enabled(kind) for kind in ("cpu", "cuda"))
+        and not torch.is_autocast_enabled("cpu")
+        and not torch.is_autocast_enabled("cuda")
     )
     return _NOTHING if same else _all(torch)
 

@@ -312,22 +312,38 @@ def checked(function: F) -> F:
         TypeError: of the function that is made, for such an argument.
     """
     signature = inspect.signature(function)
-    annotations = {
-        name: str(p.annotation)
+    own = {
+        name: p
         for name, p in signature.parameters.items()
         if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)
     }
+    annotations = {name: str(p.annotation) for name, p in own.items()}
+    defaults = {name: p.default for name, p in own.items()}
+    in_order = [name for name, p in own.items() if p.kind is not p.KEYWORD_ONLY]
+    needed = {name for name, p in own.items() if p.default is p.empty}
+    by_name = {name for name, p in own.items() if p.kind is not p.POSITIONAL_ONLY}
+
+    def arguments(args: tuple[object, ...], kwargs: dict[str, object]) -> Mapping[str, object]:
+        """Values by their parameters' names, as ``inspect`` binds them; a call that is written
+        plainly, as nearly all are, without its help, which takes longer than short functions do."""
+        if len(args) <= len(in_order) and by_name.issuperset(kwargs):
+            given = dict(zip(in_order, args, strict=False))
+            if given.keys().isdisjoint(kwargs):
+                given |= kwargs
+                if given.keys() >= needed:
+                    return given
+        return signature.bind(*args, **kwargs).arguments
 
     @functools.wraps(function)
     def call(*args: object, **kwargs: object) -> object:
         try:
-            given = signature.bind(*args, **kwargs).arguments
+            given = arguments(args, kwargs)
         except TypeError as error:
             if former := now_called(kwargs):
                 raise TypeError(f"{function.__qualname__}(): {error}{former}") from None
             return function(*args, **kwargs)  # Python's own words name the function, too
         for name, value in given.items():
-            if name not in annotations or value is signature.parameters[name].default:
+            if name not in annotations or value is defaults[name]:
                 continue
             kinds = _alternatives(annotations[name])
             if not any(_is(value, kind, function.__globals__) for kind in kinds):

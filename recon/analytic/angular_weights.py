@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import logging
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchpcct.angles import OPEN_GAP_STEPS, SAME_VIEW, is_offset, view_steps
-from torchpcct.geometry import Geometry, ParallelBeam, VolumeGrid, beam
+from torchpcct.geometry import Beam, Geometry, ParallelBeam, VolumeGrid, beam
 from torchpcct.validate import checked
 
 __all__ = ["angular_weights"]
@@ -36,12 +37,12 @@ lines at the fan's edge are not measured then."""
 WIDEST_STEP_RAD = math.radians(75.0)
 """The largest angle in rad that one view may stand for: five views a turn pass, as a test of
 operators, not of images."""
+_SMALL = 60_000
+"""Readings of a row in all views up to which weights are kept, half a megabyte of them at most."""
 
 
-@checked
-def check_gaps(angles: Floats, period: float = 2.0 * math.pi) -> None:
-    """Refuse views that are too few, or that lack inside of the arc they cover; log a warning where
-    a few lack.
+def _lacking(angles: Floats, period: float) -> str:
+    """What to say of a few views that lack inside of the arc they cover; nothing where none does.
 
     Args:
         angles: ``(views,)`` rad, any order.
@@ -75,10 +76,11 @@ def check_gaps(angles: Floats, period: float = 2.0 * math.pi) -> None:
             raise ValueError(
                 f"{lacking}; reconstruct by 'pwls' or 'mbir', or interpolate the views"
             )
-        _LOG.warning(
-            "%s: the views on either side of it are weighted in place of those that are missing",
-            lacking,
+        return (
+            f"{lacking}: the views on either side of it are weighted in place of those that are "
+            "missing"
         )
+    return ""
 
 
 @checked
@@ -103,7 +105,7 @@ def parker_share(beta: Floats, gamma: Floats, half_fan: float) -> Floats:
     end = math.pi + 2.0 * half_fan
     # A ray at the fan's edge in a minimal scan meets its conjugate at the very ends: one of the
     # two, the first, counts.
-    tiny = np.finfo(np.float64).tiny
+    tiny = 1e-300  # no angle over it overflows
     up = np.sin(0.5 * math.pi * np.clip(beta / np.maximum(rise, tiny), 0.0, 1.0)) ** 2
     down = (
         np.sin(0.5 * math.pi * np.clip((end - beta) / np.maximum(end - fall, tiny), 0.0, 1.0)) ** 2
@@ -170,8 +172,29 @@ def angular_weights(geometry: Geometry, grid: VolumeGrid | None = None) -> Float
         TypeError: not a geometry.
     """
     geometry = beam(geometry)
+    # Of other scans the grid does not matter.
+    field = grid if is_offset(geometry) else None
+    small = geometry.views * geometry.columns <= _SMALL
+    weights, lacking = (_kept_weights if small else _weights)(geometry, field)
+    if lacking:
+        _LOG.warning("%s", lacking)
+    return weights.copy() if small else weights
+
+
+def _weights(geometry: Beam, grid: VolumeGrid | None) -> tuple[Floats, str]:
+    """Those of :func:`angular_weights`, and what to say of a few views that lack."""
+    parallel = isinstance(geometry, ParallelBeam)
+    lacking = _lacking(geometry.angles, math.pi if parallel else 2.0 * math.pi)
+    return _of_covered(geometry, grid), lacking
+
+
+_kept_weights = lru_cache(maxsize=4)(_weights)
+"""Of small scans: there they take as long as the backprojection itself."""
+
+
+def _of_covered(geometry: Beam, grid: VolumeGrid | None) -> Floats:
+    """Those of :func:`angular_weights` of views that do not lack inside of their arc."""
     if isinstance(geometry, ParallelBeam):
-        check_gaps(geometry.angles, math.pi)
         if is_offset(geometry):
             steps, _, span = view_steps(geometry.angles)
             if span >= 2.0 * math.pi:
@@ -184,7 +207,6 @@ def angular_weights(geometry: Geometry, grid: VolumeGrid | None = None) -> Float
                 'reconstruct by "pwls" or "mbir"'
             )
         return steps[:, None]
-    check_gaps(geometry.angles)
     steps, start, span = view_steps(geometry.angles)
     gamma = geometry.fan_angles
     if span >= 2.0 * math.pi:

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from torchpcct.validate import choice, number, numbers, per_axis, whole
+from torchpcct.validate import checked, choice, number, numbers, per_axis, whole
 
 
 def test_clean_values_pass():
@@ -60,3 +60,49 @@ def test_clean_values_pass():
 def test_refusals_name_value_and_remedy(check, error, message):
     with pytest.raises(error, match=message):
         check()
+
+
+@checked
+def mixed(
+    first: "int", /, second: "int", third: "int" = 3, *more: int, last: "int" = 5, **rest: int
+):
+    return first, second, third, more, last, rest
+
+
+CALLS = [
+    ((1, 2), {}),
+    ((1,), {"second": 2}),
+    ((1, 2, 4, 6, 7), {"last": 8, "other": 9}),
+    ((1,), {"second": 2, "last": 8, "first": 9}),
+    ((), {}),
+    ((1,), {}),
+    ((1, 2), {"second": 2}),
+    ((), {"first": 1, "second": 2}),
+]
+
+
+@pytest.mark.parametrize(("args", "kwargs"), CALLS)
+def test_arguments_are_bound_as_python_binds_them(args, kwargs):
+    def outcome(function):
+        try:
+            return function(*args, **kwargs)
+        except TypeError as error:
+            return str(error)
+
+    assert outcome(mixed) == outcome(mixed.__wrapped__)
+
+
+@pytest.mark.parametrize(
+    ("args", "kwargs", "name"),
+    [
+        (("x", 2), {}, "first"),
+        ((1, "x"), {}, "second"),
+        ((1,), {"second": "x"}, "second"),
+        ((1, 2, "x", 4), {}, "third"),
+        ((1, 2), {"last": "x"}, "last"),
+        ((1, 2, 3, 4), {"last": "x", "other": 1}, "last"),
+    ],
+)
+def test_a_wrong_kind_is_named_however_it_is_given(args, kwargs, name):
+    with pytest.raises(TypeError, match=f"^{name} must be a whole number"):
+        mixed(*args, **kwargs)

@@ -51,7 +51,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpcct.checks.modules import module_test
-from torchpcct.checks.ray_pairs import BLOCKS, RayPairs, product, unwrapped
+from torchpcct.checks.ray_pairs import BLOCKS, WIDTHS, RayPairs, product, unwrapped
 from torchpcct.checks.scan_test import UNKNOWN, ScanTest
 from torchpcct.checks.view_scatter import view_scatter_test
 from torchpcct.detector_window import DetectorWindow
@@ -70,9 +70,6 @@ STEP_TOLERANCE = 0.001
 FALSE_ALARMS = 0.0005
 """Share of scans with an error of :data:`CENTRE_TOLERANCE` that are taken for wrong; of faultless
 ones it is less. None of 500 sound scans should give a finding."""
-_COLUMNS = (5, 25)
-"""Columns over which the slope is smoothed: a few for small errors, many for those of several
-columns."""
 _DIFFER = 0.03
 """Mean square of the difference, over that of what changes from view to view, from which conjugate
 rays differ."""
@@ -178,7 +175,7 @@ def geometry_test(
         if not fits:
             continue
         # The wider slopes reach farther, the narrower ones see smaller errors.
-        level = FALSE_ALARMS / (3.0 * len(causes) * len(_COLUMNS))
+        level = FALSE_ALARMS / (3.0 * len(causes) * len(WIDTHS))
         best = next((f for f in reversed(fits) if f.exceeds(level, _LARGEST)), fits[0])
         sizes[name], errors[name] = best.size, best.error
         if best.exceeds(level, _LARGEST):
@@ -346,7 +343,7 @@ def _mismatch_text(mismatch: float, strangers: bool, mirrored: bool) -> str:
 def _centre(pairs: RayPairs, false_alarms: float) -> tuple[ScanTest, float]:
     """The centre's test, and how much of the squared difference its error explains."""
     found = []
-    for columns in _COLUMNS:
+    for columns in WIDTHS:
         sums = pairs.sums(pairs.shifted(), columns)
         if sums is not None:
             turn = 2.0 * pairs.angles
@@ -358,7 +355,7 @@ def _centre(pairs: RayPairs, false_alarms: float) -> tuple[ScanTest, float]:
                 stray = _Stray(
                     pairs.aligned("centre"), pairs.shared_error(pairs.shifted(), columns, size)
                 )
-                test = _tested(score, bent, design, false_alarms / len(_COLUMNS), stray)
+                test = _tested(score, bent, design, false_alarms / len(WIDTHS), stray)
                 found.append((test, test.sizes["centre"] ** 2 * float(power.sum())))
     return next((f for f in found if f[0].findings), found[0] if found else (UNKNOWN, 0.0))
 
@@ -467,7 +464,7 @@ def _fit(pairs: RayPairs, name: str, columns: int, tolerance: float) -> _Fit | N
 
 def _fits(pairs: RayPairs, name: str, tolerance: float) -> list[_Fit]:
     """By narrow slopes and by wide ones; those that there are."""
-    tried = (_fit(pairs, name, columns, tolerance) for columns in _COLUMNS)
+    tried = (_fit(pairs, name, columns, tolerance) for columns in WIDTHS)
     return [fit for fit in tried if fit is not None]
 
 

@@ -47,6 +47,8 @@ _DETAILS = 0.05
 are narrower than a cell: what is lost reads 0."""
 _MOST_DIM = 200_000
 """Readings that are looked at for it."""
+_IN_CACHE = 2**16
+"""Readings that are compared at a time."""
 _SIGMAS = 8.0
 """Standard errors from which a deviation is none of chance."""
 _TOGETHER = 2
@@ -161,9 +163,7 @@ def find_defects(
             f"first_column must hold {views} columns of a detector with {air.shape[1]}"
         )
     light = BRIGHT * photon + _SIGMAS * electronic_noise
-    parts = [np.s_[:, c : c + columns] for c in first]
-    # View by view: what is compared stays in the cache.
-    zeros = np.array([np.count_nonzero(view <= 0) for view in n])
+    zeros = _zeros(n)
     if cells is None:
         lost = dark_views(zeros / n[0].size)
         cells = wrong_cells(cell_sums(n, air, first, lost, light), lost, photon, light)
@@ -172,13 +172,13 @@ def find_defects(
     new = None if known is None else ~known.numpy()
     if new is not None:
         fresh = np.zeros_like(dead)
-        for part, those in zip(parts, new, strict=True):
-            fresh[part] |= those
+        for c, those in zip(first.tolist(), new, strict=True):
+            fresh[:, c : c + columns] |= those
         dead, hot, view_dead = dead & fresh, hot & fresh, view_dead & new.any((1, 2))
     mask, wrong = np.zeros(n.shape, bool), dead | hot
     if wrong.any() or view_dead.any():
-        for those, lost, part in zip(mask, view_dead, parts, strict=True):
-            those[...] = lost | wrong[part]
+        for those, lost, c in zip(mask, view_dead, first.tolist(), strict=True):
+            those[...] = lost | wrong[:, c : c + columns]
         if new is not None:
             mask &= new
     at = np.zeros((0, 3), np.int64)
@@ -199,6 +199,14 @@ def find_defects(
         len(single) - lasting,
         resting,
     )
+
+
+def _zeros(n: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Readings of each view that are 0 or less; some views at a time: what is compared stays in
+    the cache."""
+    together = max(1, _IN_CACHE // max(n[0].size, 1))
+    parts = [n[k : k + together] <= 0 for k in range(0, len(n), together)]
+    return np.concatenate([np.count_nonzero(part, axis=(1, 2)) for part in parts])
 
 
 class DefectiveCells(NamedTuple):

@@ -309,7 +309,7 @@ def _step(theta: Floats, moments: list[Floats]) -> tuple[float, float, float]:
     for order, y in enumerate(moments, start=1):
         orders = (1, 2)[:order]
         s = 0.0
-        for _ in range(3):
+        for last in (False, False, True):
             turned = (1.0 + s) * theta
             design = _waves(turned, orders)
             found = np.linalg.lstsq(design, y, rcond=None)[0]
@@ -318,7 +318,11 @@ def _step(theta: Floats, moments: list[Floats]) -> tuple[float, float, float]:
                 for i, k in enumerate(orders)
             )
             pattern = turning * (theta - theta.mean())
-            values, errors = _fit(np.column_stack([design, pattern]), y)
+            both = np.column_stack([design, pattern])
+            if last:
+                values, errors = _fit(both, y)
+            else:
+                values = np.linalg.lstsq(both, y, rcond=None)[0]
             s += float(np.clip(values[-1], -0.1, 0.1))
         own = pattern - design @ np.linalg.lstsq(design, pattern, rcond=None)[0]
         waves = [float(own @ (y * wave(theta))) for wave in (np.cos, np.sin)]

@@ -32,6 +32,7 @@ from __future__ import annotations
 import hashlib
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -233,24 +234,12 @@ class _Views:
     def means(self, width: int, slope: bool = False) -> tuple[Floats, Floats]:
         """Means under Hann windows of so many columns, of two sets of columns that do not touch,
         ``(views, rows, windows)``; ``slope``: of the slopes along the columns, per column."""
-        columns = self.p.shape[-1]
-        number = max(2, round(2.0 * (columns - width) / width) + 1)
-        starts = np.linspace(0.0, columns - width, number)
-        middle = (starts + width / 2.0).astype(int)
+        middle, windows, sets, slopes = _windows(self.p.shape[-1], width)
+        number = middle.size
         self.body = self.seen[middle] | (np.arange(number) == number // 2)
-        at = np.arange(columns)
-        x = (at[:, None] + 0.5 - starts) / width
-        inside = (x > 0.0) & (x < 1.0)
-        windows = np.where(inside, 1.0 - np.cos(2.0 * math.pi * x), 0.0)
         self.lit = (windows * self.shadow[:, None]).max(0) > 0.0
-        if slope:  # the window's own slope, of the other sign: no difference of noisy readings
-            slopes = np.where(inside, -np.sin(2.0 * math.pi * x) * 2.0 * math.pi / width, 0.0)
-        sets = []
-        for part in ((0, 1), (3, 4)):
-            chosen = np.isin(at % 6, part)[:, None]
-            total = (windows * chosen).sum(0)
-            sets.append(self.p @ ((slopes if slope else windows) * chosen / total))
-        return sets[0], sets[1]
+        one, other = slopes if slope else sets
+        return self.p @ one, self.p @ other
 
     @property
     def width(self) -> int:
@@ -545,6 +534,33 @@ class _Views:
         return 2.0 * math.hypot(*found), 2.0 * max(power)
 
 
+@lru_cache(maxsize=4)
+def _windows(
+    columns: int, width: int
+) -> tuple[NDArray[np.int64], Floats, tuple[Floats, ...], tuple[Floats, ...]]:
+    """Hann windows of so many columns, half of which overlap: the columns in their middles; the
+    windows, ``(columns, windows)``; and of two sets of columns that do not touch what takes the
+    means under the windows, and what takes the slopes per column."""
+    number = max(2, round(2.0 * (columns - width) / width) + 1)
+    starts = np.linspace(0.0, columns - width, number)
+    middle = (starts + width / 2.0).astype(int)
+    at = np.arange(columns)
+    x = (at[:, None] + 0.5 - starts) / width
+    inside = (x > 0.0) & (x < 1.0)
+    windows = np.where(inside, 1.0 - np.cos(2.0 * math.pi * x), 0.0)
+    # The window's own slope, of the other sign: no difference of noisy readings.
+    slopes = np.where(inside, -np.sin(2.0 * math.pi * x) * 2.0 * math.pi / width, 0.0)
+    parts = [np.isin(at % 6, part)[:, None] for part in ((0, 1), (3, 4))]
+    totals = [(windows * chosen).sum(0) for chosen in parts]
+    sets = [
+        tuple(kind * chosen / total for chosen, total in zip(parts, totals, strict=True))
+        for kind in (windows, slopes)
+    ]
+    for array in (middle, windows, *sets[0], *sets[1]):
+        array.setflags(write=False)
+    return middle, windows, sets[0], sets[1]
+
+
 def _beside(values: Floats, closes: bool) -> Floats:
     """Median of the values 6 … 14 places before and behind each, along the first axis."""
     n = len(values)
@@ -680,6 +696,10 @@ def _copies(n: NDArray[np.float32], telling: NDArray[np.bool_], angles: Floats) 
     first: dict[bytes, int] = {}
     found = []
     whole = np.flatnonzero(telling.mean((1, 2)) > 0.5).tolist()
+    # Views that add up to different sums are different: nearly always all are.
+    sums = n.sum((1, 2), dtype=np.float64)[whole]
+    if np.unique(sums).size == len(whole):
+        return []
     for k in whole:
         before = first.setdefault(hashlib.sha256(n[k].tobytes()).digest(), k)
         if before != k and abs(angles[k] - angles[before]) > 1e-9:

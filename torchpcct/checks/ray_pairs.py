@@ -35,6 +35,9 @@ _GAP_STEPS = 3.0
 it."""
 _ROWS = 9
 """Most rows over which slopes are smoothed."""
+WIDTHS = (5, 25)
+"""Columns over which slopes are smoothed: a few for small errors, many for those of several
+columns; raw ones over a fifth of them."""
 _FLAT_CELLS = 2.0
 """Rows count whose conjugate rays part by less, along z."""
 _ALIGNED = {"centre": 0.05, "step": 0.06, "scale": 0.25, "roll": 0.05}
@@ -64,6 +67,7 @@ class RayPairs:
         self.difference = self.here - self.conjugate
         self.parted = parted * float(self.known.sum())
         self._slopes: dict[tuple[str, int], tuple[Any, ...]] = {}
+        self._in_rows: dict[str, dict[int, list[Tensor]]] = {}
 
     @classmethod
     def of(
@@ -144,13 +148,11 @@ class RayPairs:
         """Smoothed slopes of both rays, raw ones of both, and where they are known."""
         if (along, columns) not in self._slopes:
             sizes, known = ((_ROWS, columns), (1, columns // 5)), self._pairs.whole(columns)
-            if along == "columns":
-                pairs = _filtered((self.here, self.conjugate), _difference, sizes)
-            else:
+            pairs = self._smoothed(along, sizes)
+            if along == "angles":
                 before, behind = self.beside
                 step, rate = self._pairs.step, self._pairs.rate
-                changes = (behind[0] - before[0], behind[1] - before[1])
-                pairs = [[v / step for v in both] for both in _filtered(changes, _mean, sizes)]
+                pairs = [[v / step for v in both] for both in pairs]
                 if bool((rate != 0.0).any()):  # of a window that moves with the views
                     pairs = [
                         [turned - rate * slope for turned, slope in zip(*both, strict=True)]
@@ -159,6 +161,30 @@ class RayPairs:
                 known = known & before[2] & behind[2]
             self._slopes[along, columns] = (*pairs, known)
         return self._slopes[along, columns]
+
+    def _smoothed(self, along: str, sizes: tuple[tuple[int, int], ...]) -> list[list[Tensor]]:
+        """Slopes of both rays along the columns, or their changes from the view before to the one
+        behind, smoothed over so many rows and columns.
+
+        Of single rows, where the number of rows does not matter, all widths at once and kept: the
+        time is that of the widest.
+        """
+        kernel_of: Callable[[int], Tensor] = _difference if along == "columns" else _mean
+        if self.here.shape[1] > 1:
+            return _filtered(self._changes(along), kernel_of, sizes)
+        if along not in self._in_rows:
+            widths = sorted({w for columns in WIDTHS for w in (columns, columns // 5)})
+            found = _filtered(self._changes(along), kernel_of, tuple((1, w) for w in widths))
+            self._in_rows[along] = dict(zip(widths, found, strict=True))
+        return [self._in_rows[along][columns] for _, columns in sizes]
+
+    def _changes(self, along: str) -> tuple[Tensor, Tensor]:
+        """Of both rays: what they read, or how that changes from the view before to the one
+        behind."""
+        if along == "columns":
+            return self.here, self.conjugate
+        before, behind = self.beside
+        return behind[0] - before[0], behind[1] - before[1]
 
     @cached_property
     def beside(self) -> list[tuple[Tensor, Tensor, Tensor]]:

@@ -470,14 +470,7 @@ def _transfer(
     parts = np.split(order, np.searchsorted(at[order], np.arange(1, len(edges) - 1)))
     # Over √m, so that the dimmer ones of a class do not count for more.
     second /= np.sqrt(np.maximum(6.0 * mean, 1e-300))
-    found = [
-        (
-            mean[p].mean(),
-            quartile_sd(second[p]) ** 2 * mean[p].mean(),
-        )
-        if p.size
-        else (0.0, 0.0)
-        for p in parts
-    ]
-    m, v = np.array(found).T
+    m = np.array([mean[p].mean() if p.size else 0.0 for p in parts])
+    sd = [quartile_sd(second[p]) if p.size else 0.0 for p in parts]
+    v = np.array([s**2 * level for s, level in zip(sd, m.tolist(), strict=True)])
     return m, v, np.array([p.size for p in parts])

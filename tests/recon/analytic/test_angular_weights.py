@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from recon.analytic.angular_weights import angular_weights, parker_share
 from recon.analytic.coverage import view_notes
 from torchpcct.angles import view_steps
-from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, full_turn
+from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 
 FAN = dict(sod=570.0, sdd=1040.0, columns=81, pitch=8.0)
 HALF_FAN = math.atan(40 * 8.0 / 1040.0)
@@ -155,6 +155,31 @@ def test_both_ends_of_a_turn_share_one_step(turn, views, dtype, caplog):
     assert f"from 0° to {turn:.0f}°, both ends included" in note
     assert ("mirrored" in note) == (turn == 180.0)
     assert view_notes(replace(geometry, angles=geometry.angles[:-1])) == []
+
+
+def test_each_call_warns_and_has_weights_of_its_own(caplog):
+    """Those of small scans are kept, of which a caller who changes them must know nothing."""
+    angles = np.delete(np.arange(300), [50, 51, 52]) * math.pi / 180
+    geometry = FanBeam(angles, **FAN)
+    expected = angular_weights(replace(geometry, angles=angles + 1e-3))
+    caplog.clear()
+    for calls in (1, 2):
+        weights = angular_weights(geometry)
+        np.testing.assert_allclose(weights, expected, atol=1e-6)
+        weights[:] = 0.0
+        assert caplog.text.count("gap of 4.00° where the usual step is 1.00°") == calls
+
+
+def test_weights_of_a_short_scan_follow_the_grid():
+    """Of an offset detector's short scan one grid is complete, a larger one is refused."""
+    geometry = FanBeam(np.arange(230) * math.pi / 180, 570.0, 1040.0, 81, 8.0, offset=200.0)
+    small = VolumeGrid((8, 8), 5.0)
+    assert angular_weights(geometry, small).shape == (230, 81)
+    with pytest.raises(ValueError, match="needs a full turn"):
+        angular_weights(geometry)
+    with pytest.raises(ValueError, match="needs a full turn"):
+        angular_weights(geometry, VolumeGrid((80, 80), 5.0))
+    assert angular_weights(geometry, small).shape == (230, 81)
 
 
 def test_too_few_views_are_refused():

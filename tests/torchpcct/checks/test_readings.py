@@ -13,7 +13,13 @@ from recon import reconstruct
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, full_turn
 from torchpcct.checks.defects import repair_defects
 from torchpcct.checks.readings import reading_warnings
-from torchpcct.readings import interpolate_dead, log_bias, smoothed
+from torchpcct.readings import (
+    QUARTILES_TO_SD,
+    interpolate_dead,
+    log_bias,
+    quartile_sd,
+    smoothed,
+)
 
 MU = 0.02
 AIR = 1e5
@@ -349,3 +355,14 @@ def test_views_that_were_stored_twice_are_no_dead_time(first, copies):
 def test_a_mask_is_no_readings():
     with pytest.raises(TypeError, match="array of real numbers"):
         Scan.from_counts(counted() > 100.0, FAN, air=AIR)
+
+
+def test_quartiles_are_those_of_numpy():
+    random = np.random.default_rng(0)
+    for size in [*range(1, 30), 500, 501]:
+        values = random.normal(size=size)
+        values[::4] = values[0]
+        upper, lower = np.quantile(values, (0.75, 0.25))
+        assert quartile_sd(values) == (upper - lower) * QUARTILES_TO_SD
+        values[size // 2] = math.nan
+        assert math.isnan(quartile_sd(values))
