@@ -41,9 +41,10 @@ __all__ = ["Scan"]
 
 NOISE_FREE_EXPOSURE_S = 1.0
 """The exposure that the expected readings of a noise-free scan stand for."""
-_FOLLOWED = 100.0
+_FOLLOWED = 1000.0
 """Photons of a reading below which a weight that follows its noise moves the mean of a fit: the
-reading is a fifth of the mean about it, so the line integral is off by -0.2 / photons."""
+reading is a fifth of the mean about it, so the line integral is off by -0.2 / photons: of 100 by
+0.4 HU behind 20 cm of water."""
 _TENSORS = ("counts", "air", "exterior", "quantum", "flux", "dead")
 """Members that lie on a device."""
 

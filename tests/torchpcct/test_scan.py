@@ -12,6 +12,7 @@ import torch
 from refusals import refused
 
 import torchpcct
+import torchpcct.spectral  # a submodule that no other import here need load
 from recon import reconstruct
 from recon.analytic.inset import InsetFbp
 from torchpcct import (
@@ -290,7 +291,7 @@ def test_scans_geometries_and_volumes_print_in_a_few_lines():
     assert set(torchpcct.__all__) <= set(dir(torchpcct))
 
 
-@pytest.mark.parametrize("photons", [3.0, 10.0, 40.0])
+@pytest.mark.parametrize("photons", [3.0, 10.0, 40.0, 150.0])
 def test_weights_of_few_photons_do_not_follow_the_noise_of_their_readings(photons):
     """A weighted mean of line integrals is theirs: bright readings weighed more, which lowered it
     by a fifth of a photon."""
