@@ -78,6 +78,8 @@ CALLS = [
     ((1,), {}),
     ((1, 2), {"second": 2}),
     ((), {"first": 1, "second": 2}),
+    (("x",), {}),
+    ((1, 2), {"second": "x"}),
 ]
 
 
@@ -90,6 +92,15 @@ def test_arguments_are_bound_as_python_binds_them(args, kwargs):
             return str(error)
 
     assert outcome(mixed) == outcome(mixed.__wrapped__)
+
+
+def test_an_unknown_name_is_refused_before_a_wrong_kind():
+    @checked
+    def plain(first: "int") -> "int":
+        return first
+
+    with pytest.raises(TypeError, match="unexpected keyword argument 'other'"):
+        plain("x", other=1)
 
 
 @pytest.mark.parametrize(
