@@ -80,8 +80,9 @@ VIEWS_A_TRANSFORM = 5.0
 """Views that are projected, both ways, in the time of a Fourier transform and its inverse (3 in a
 plane, 5.5 in a volume, on one core). As many iterations are made as take the time of one pair."""
 INNER_OF_VOLUMES = 8
-"""Iterations where the model has a coarser scan. Of thin plates 6 to 10 took 4.7 to 5.6 s and 35 to
-29 pairs, of a thorax 5 and 10 took 2.1 and 2.7 s, 16 and 13 pairs."""
+"""Iterations where the model has a coarser scan. Twice as many save up to a third of the pairs of
+hard objects, hardly any of easy ones, and no time: each costs half to two thirds of a pair
+(``tests/bench/solver_parts.md``)."""
 
 
 class FieldModel:
