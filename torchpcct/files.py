@@ -25,7 +25,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchpcct.formats.hdf5 import require_inside
+from torchpcct.hdf5 import require_inside
 
 if TYPE_CHECKING:
     from types import FrameType

@@ -11,7 +11,7 @@ import numpy as np
 
 from torchpcct.formats.damage import check_expansion, check_size, needed, reading
 from torchpcct.formats.file_names import matching
-from torchpcct.formats.hdf5 import inside
+from torchpcct.hdf5 import inside
 from torchpcct.validate import choice
 
 if TYPE_CHECKING:

@@ -18,10 +18,10 @@ import numpy as np
 from torchpcct.formats.arrays import given_array
 from torchpcct.formats.damage import check_expansion, check_size, reading
 from torchpcct.formats.geometry_yaml import angles_of
-from torchpcct.formats.hdf5 import inside
 from torchpcct.formats.lengths import MM, RAD, unit_text
 from torchpcct.formats.signed_readings import unwrapped
 from torchpcct.geometry import ParallelBeam
+from torchpcct.hdf5 import inside
 from torchpcct.readings import TRANSFER_FRAMES
 from torchpcct.scan import Scan
 from torchpcct.validate import number

@@ -16,8 +16,8 @@ import numpy as np
 from torchpcct.formats.damage import check_expansion, check_size, reading
 from torchpcct.formats.data_exchange import Frames, angles_in, given_frames, length_in
 from torchpcct.formats.geometry_yaml import angles_of
-from torchpcct.formats.hdf5 import inside
 from torchpcct.formats.lengths import unit_text
+from torchpcct.hdf5 import inside
 from torchpcct.scan import Scan
 from torchpcct.validate import choice
 

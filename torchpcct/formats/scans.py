@@ -16,13 +16,13 @@ from torchpcct.formats.catsim import read_catsim
 from torchpcct.formats.damage import reading
 from torchpcct.formats.data_exchange import read_data_exchange
 from torchpcct.formats.dicom_ct_pd import read_dicom_ct_pd
-from torchpcct.formats.hdf5 import inside
 from torchpcct.formats.matlab import read_mat_scan
 from torchpcct.formats.nexus import holds_nexus, read_nexus
 from torchpcct.formats.nikon import read_xtekct
 from torchpcct.formats.stack import read_stack
 from torchpcct.formats.zeiss import read_txrm
 from torchpcct.geometry import Geometry
+from torchpcct.hdf5 import inside
 from torchpcct.scan import Scan
 from torchpcct.scan_file import slice_axis, sliced
 from torchpcct.validate import number
