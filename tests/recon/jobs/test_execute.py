@@ -759,47 +759,62 @@ run([Job("x", noted, ("x", 1))], Path({folder!r}), cluster)
 """
 
 
-@pytest.mark.extended
-@pytest.mark.cluster
-def test_the_recipe_of_srun(tmp_path):
-    """The page's script as it stands, with an ``srun`` that starts one process of each step
-    here."""
-    pytest.importorskip("distributed")
+@contextlib.contextmanager
+def job_of_the_page(folder, srun):
+    """The page's script for SLURM as it stands, run in a folder: its process and its text."""
     (script,) = re.findall(r"```bash\n(#!/bin/bash.*?)```", PAGE.read_text(encoding="utf-8"), re.S)
     path = [p for p in sys.path if p]
     texts = {
-        "srun": SRUN,
-        "torchpcct": COMMAND.format(python=sys.executable, path=path, folder=str(tmp_path)),
-        "job": script.replace("/shared/$USER", str(tmp_path)),
+        "srun": srun,
+        "torchpcct": COMMAND.format(python=sys.executable, path=path, folder=str(folder)),
+        "job": script.replace("/shared/$USER", str(folder)),
     }
     for name, text in texts.items():
-        (tmp_path / name).write_text(text)
-        (tmp_path / name).chmod(0o755)
+        (folder / name).write_text(text)
+        (folder / name).chmod(0o755)
     environment = {
         **os.environ,
         "PATH": os.pathsep.join(
-            [str(tmp_path), str(Path(sys.executable).parent), os.environ["PATH"]]
+            [str(folder), str(Path(sys.executable).parent), os.environ["PATH"]]
         ),
         "SLURM_JOB_ID": "17",
-        "CALLS": str(tmp_path / "calls"),
+        "CALLS": str(folder / "calls"),
         "PYTHONPATH": os.pathsep.join(path),
     }
     job = subprocess.Popen(
-        [tmp_path / "job"],
-        cwd=tmp_path,
+        [folder / "job"],
+        cwd=folder,
         env=environment,
-        stderr=subprocess.PIPE,
-        text=True,
+        stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
     try:
-        assert job.wait(600) == 0
+        yield job, script
     finally:
-        os.killpg(job.pid, signal.SIGKILL)  # as SLURM ends the steps of a job that is over
-        job.stderr.close()
+        with contextlib.suppress(ProcessLookupError):  # none of its steps is left
+            os.killpg(job.pid, signal.SIGKILL)  # as SLURM ends the steps of a job that is over
+        job.wait()
+
+
+@pytest.mark.extended
+@pytest.mark.cluster
+def test_the_recipe_of_srun(tmp_path):
+    """The page's script with an ``srun`` that starts one process of each step here."""
+    pytest.importorskip("distributed")
+    with job_of_the_page(tmp_path, SRUN) as (job, script):
+        assert job.wait(600) == 0
     assert (tmp_path / "x.txt").read_text() == "1"
     tasks = re.findall(r"--ntasks=(\d+) --exact", (tmp_path / "calls").read_text())
     assert sum(map(int, tasks)) == int(re.search(r"#SBATCH --ntasks=(\d+)", script)[1])
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a script of bash")
+def test_the_recipe_of_srun_ends_where_the_scheduler_does(tmp_path):
+    """It would wait for the scheduler's file until the allocation is over."""
+    failing = SRUN.replace('exec "$@"', "exit 3")
+    with job_of_the_page(tmp_path, failing) as (job, _):
+        assert job.wait(60) == 1
+    assert "torchpcct" not in (tmp_path / "calls").read_text()
 
 
 def test_a_dry_run_lists_the_jobs(here, cli):
