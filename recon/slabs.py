@@ -656,7 +656,7 @@ def _as_jobs(
     folder: Path,
     keep: Callable[..., None],
 ) -> None:
-    """Let workers make the slabs as pieces in ``folder``; each is kept when its turn has come."""
+    """Let workers make the slabs, cached in ``folder``; each is kept when its turn has come."""
     packed, plane = pickle.dumps(maker), math.prod(maker.grid.shape[1:])
     jobs = [
         execute.Job(
@@ -676,7 +676,7 @@ def _as_jobs(
         done.add(job.args[2:])
         while waiting and waiting[0] in done:
             first, stop = waiting.popleft()
-            block = _slab_piece(folder, maker, key, first, stop)
+            block = _cached_slab(folder, maker, key, first, stop)
             keep(
                 stop,
                 block["values"],
@@ -689,7 +689,7 @@ def _as_jobs(
 
 
 def _slab(folder: Path, packed: bytes, key: str, first: int, stop: int) -> None:
-    _slab_piece(folder, _unpacked(packed), key, first, stop)
+    _cached_slab(folder, _unpacked(packed), key, first, stop)
 
 
 @lru_cache(maxsize=1)
@@ -698,7 +698,7 @@ def _unpacked(packed: bytes) -> _Maker:
     return maker
 
 
-def _slab_piece(folder: Path, maker: _Maker, key: str, first: int, stop: int) -> dict[str, Array]:
+def _cached_slab(folder: Path, maker: _Maker, key: str, first: int, stop: int) -> dict[str, Array]:
     def compute() -> dict[str, Array]:
         values, texts = maker(first, stop)
         return {
@@ -707,7 +707,7 @@ def _slab_piece(folder: Path, maker: _Maker, key: str, first: int, stop: int) ->
             "peaks": np.array(list(texts.values())),
         }
 
-    return Store(folder).piece(f"{first}-{stop}", key, compute)
+    return Store(folder).cached(f"{first}-{stop}", key, compute)
 
 
 def _slices_of(grid: VolumeGrid, first: int, stop: int) -> VolumeGrid:

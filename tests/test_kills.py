@@ -2,7 +2,7 @@
 had been.
 
 Each command runs in its own process, as a person starts it; its settings alone are small. What dies
-in the middle of a piece or of a write is :mod:`recon.study.test_store` and :mod:`train.test_run`;
+in the middle of a result or of a write is :mod:`recon.jobs.test_store` and :mod:`train.test_run`;
 here nobody chooses the moment.
 """
 
@@ -39,15 +39,15 @@ from recon.jobs.store import Store
 out, name = sys.argv[1:]
 kind = registry.settings_class(name) if name != "evaluate" else type("", (), {})
 kind.QUICK = TINY.get(name)
-piece = Store.piece
+cached = Store.cached
 def noted(self, at, key, compute):
     def computed():
         arrays = compute()
         with Path(out + ".computed").open("a") as file:
             file.write(at + "\\n")
         return arrays
-    return piece(self, at, key, computed)
-Store.piece = noted
+    return cached(self, at, key, computed)
+Store.cached = noted
 Path(out + ".begun").touch()
 if name == "evaluate":
     # On the voxels that the network knows.
@@ -167,7 +167,7 @@ def test_studies_killed_at_random_moments(name, tmp_path):
         (tmp_path / f"{x}.computed").read_text().split("\n")[:-1] for x in ("killed", "whole")
     )
     assert set(killed) == set(whole)
-    assert len(killed) <= len(whole) + kills  # a piece that was computed, not yet written
+    assert len(killed) <= len(whole) + kills  # what was computed, not yet written
     reports = [json.loads((tmp_path / x / "report.json").read_text()) for x in ("whole", "killed")]
     for report in reports:
         report.pop("command", None)

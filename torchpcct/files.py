@@ -432,13 +432,13 @@ def _sync(path: Path) -> None:
 
 
 _FIRST_MEMBER = (30, b"key.npy")
-"""Where the name of a ZIP archive's first file stands, and which it is in a piece: by it a
-damaged one is known."""
+"""Where the name of a ZIP archive's first file stands, and which it is in a cached
+result: by it a damaged one is known."""
 
 
 def is_foreign(path: Path) -> bool:
-    """Whether something is there that is no piece (:mod:`recon.jobs.store`), not even a
-    damaged or older one."""
+    """Whether something is there that is no cached result (:mod:`recon.jobs.store`), not even
+    a damaged or older one."""
     try:
         if path.is_symlink() or not path.is_file():
             return path.is_symlink() or path.exists()

@@ -75,15 +75,15 @@ def main() -> None:
         f"volume {volume:.2f} s on average) |",
         f"| all of it | {total / 3600:,.0f} core hours, {total / 3600 * EUROS_PER_CORE_HOUR:,.0f} "
         f"€ at {EUROS_PER_CORE_HOUR} € a core hour |",
-        f"| kept | {TASKS * METHODS * DRAWS * m['bytes_realisation'] / 1e12:.2f} TB of pieces, and "
-        f"{TASKS * m['bytes_scans'] / 1e12:.2f} TB of noise-free scans |",
-        f"| network, disk not shared | the pieces once, and {m['bytes_job'] / 1e3:.0f} kB of "
+        f"| kept | {TASKS * METHODS * DRAWS * m['bytes_realisation'] / 1e12:.2f} TB of cached "
+        f"results, and {TASKS * m['bytes_scans'] / 1e12:.2f} TB of noise-free scans |",
+        f"| network, disk not shared | the results once, and {m['bytes_job'] / 1e3:.0f} kB of "
         "arguments a job |",
         f"| memory | {m['mib_worker']:.0f} MiB a worker |",
         "",
         "## Block size and workers",
         "",
-        "Realisations of a piece are computed by one job for all methods. Share of the workers' "
+        "Realisations of a block are computed by one job for all methods. Share of the workers' "
         f"time that computes, simulated; {100 * SLOW_SHARE:g} % of the nodes are {SLOW:g} times "
         f"slower, {DEATHS_PER_HOUR:g} deaths a worker and hour:",
         "",
@@ -128,7 +128,7 @@ def main() -> None:
         f"jobs a second, feed {rate * 8 * realisation:,.0f} workers with blocks of 8.",
         "",
         "So the block of `recon/evaluate/measure.py` stays at 8; what a campaign of this size "
-        "lacks is a store that packs the pieces of a task into few files.",
+        "lacks is a store that packs the results of a task into few files.",
         "",
     ]
     (HERE / "plan.md").write_text("\n".join(lines), encoding="utf-8")

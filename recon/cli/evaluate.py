@@ -137,7 +137,7 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
         return
     found = None
     settings = {"exposures_s": arguments.exposures_s, "n": n, "seed": arguments.seed}
-    before = measured_before(out / "report.json", tasks, out / "pieces", **settings)
+    before = measured_before(out / "report.json", tasks, out / "cache", **settings)
     methods = [*before, *(name for name in methods if name not in before)]
     with executing(arguments, out):
         found = evaluate(
@@ -146,7 +146,7 @@ def _evaluate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
             exposures_s=arguments.exposures_s,
             n=n,
             seed=arguments.seed,
-            folder=out / "pieces",
+            folder=out / "cache",
             progress=progress,
         )
     progress.close()
@@ -377,7 +377,7 @@ def add_evaluate(commands: Commands) -> None:
         "how much dose does a method save at a task?",
         "Measure reconstruction methods, yours too, at tasks, ready or yours, on the same noise "
         "realisations: dose factors with intervals beside the Cramér–Rao bound, noise, error, "
-        "contrast, detectability, pictures. Finished pieces are kept in the folder: the same "
+        "contrast, detectability, pictures. Finished results are cached in the folder: the same "
         "command goes on after an interruption, and a second one with more methods computes only "
         "those.",
         "torchpcct evaluate --task nodule --method mbir --n 20",
@@ -461,7 +461,7 @@ def add_dose_factor(commands: Commands) -> None:
         "the whole measurement: every method of the package at every plaque task",
         "evaluate with the methods of this package, the simple filters among them, at the paper's "
         "plaque, its variants, vessels of other directions, a sphere in muscle, line pairs and a "
-        "low-contrast rod, with 200 realisations: hours on two cores, kept piece by piece.",
+        "low-contrast rod, with 200 realisations: hours on two cores; what is finished is cached.",
         "torchpcct dose-factor --task plaque --method mbir --method fbp:soft --n 40",
         before=METHODS_TEXT,
         out="folder for report.md, .json, .csv, .html and pictures (default out/dose-factor)",

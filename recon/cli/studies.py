@@ -39,7 +39,7 @@ def _run_study(
     check_results(
         arguments, folder, lambda report: report.get("study") in names, "report.*", "*.png"
     )
-    from recon.jobs.store import Pieces  # loads torch
+    from recon.jobs.store import StudyCache  # loads torch
 
     start = time.perf_counter()
     report = None
@@ -49,7 +49,7 @@ def _run_study(
     if report is None:
         return
     files = report.save(folder)
-    Pieces.clear(folder)
+    StudyCache.clear(folder)
     print(report.screen)
     print(f"\n{time.perf_counter() - start:.0f} s in all. Written: {', '.join(map(str, files))}")
 

@@ -15,7 +15,7 @@ Your denoiser on a lung nodule:
     from recon.evaluate import denoiser, evaluate, save
 
     found = evaluate(
-        "nodule", ["mbir", denoiser(mine, "fbp:detail")], n=20, folder="out/mine/pieces"
+        "nodule", ["mbir", denoiser(mine, "fbp:detail")], n=20, folder="out/mine/cache"
     )
     save(found, "out/mine")
 """

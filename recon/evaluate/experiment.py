@@ -1,8 +1,8 @@
 """Tasks × methods × exposures × realisations: the jobs of the instrument, and what they found.
 
-An evaluation is a list of jobs (:func:`_jobs`), each of which keeps pieces in a folder: what is
+An evaluation is a list of jobs (:func:`_jobs`), each of which caches results in a folder: what is
 there already is not computed again. They are run here or by an executor
-(:mod:`recon.jobs.execute`); then the pieces are read.
+(:mod:`recon.jobs.execute`); then the cache is read.
 """
 
 from __future__ import annotations
@@ -103,9 +103,9 @@ def evaluate(
         exposures_s: of the scans in s, one or a list; None: those of each task.
         n: realisations of each, at least 8.
         seed: of the first.
-        folder: where scans and finished pieces are kept; the same call goes on after an
+        folder: where scans and finished results are cached; the same call goes on after an
             interruption, and a second one with more methods or realisations computes what is new.
-            None: nothing is kept.
+            None: nothing is cached.
         progress: called with a text and the finished fraction of it.
         executor: where volumes are computed, any of :mod:`concurrent.futures`, best one of
             :mod:`recon.jobs.execute`; None: that of :func:`recon.jobs.execute.using`, else
@@ -289,7 +289,7 @@ def _jobs(
                 if not asked:
                     continue
                 weighted |= any(bench.methods[name].energies is not None for name in asked)
-                pieces = (
+                files = (
                     f"{place}{kept[m.name][0]}/{part}.npz" for m in group for part in _parts(m, k)
                 )
                 name = (
@@ -305,7 +305,7 @@ def _jobs(
                         name,
                         _run_job,
                         (given, "block", exposure, asked, k),
-                        (*pieces, f"{place}*sigma_*.npz", f"{place}energies_*.npz"),
+                        (*files, f"{place}*sigma_*.npz", f"{place}energies_*.npz"),
                         (first, *in_bins, known) if k else (first, *in_bins),
                         seconds=seconds,
                         mib=mib,
@@ -321,12 +321,12 @@ def _jobs(
 
 
 def _blocks(n: int) -> list[range]:
-    """Realisations, a piece each."""
+    """Realisations that are measured and cached together."""
     return [range(start, min(start + BLOCK, n)) for start in range(0, n, BLOCK)]
 
 
 def _parts(method: Method, k: range) -> tuple[str, ...]:
-    """Names of the pieces of a block; of none those without noise."""
+    """Names of what is cached of a block; of an empty one, of noise-free data."""
     if k:
         return (f"{k.start}-{k.stop}",)
     return ("clean",) if method.network is None else ("clean", "response")
@@ -415,8 +415,8 @@ class _Bench:
         self.realisations.exact_covariances(kernels)
 
     def block(self, exposure: float, names: Sequence[str], k: range) -> None:
-        """Pieces of methods at an exposure: of a block of realisations, or of none what is
-        without noise."""
+        """Measure methods at an exposure and cache it: a block of realisations, or, if it is
+        empty, noise-free data."""
         pairs = self._pairs(exposure, k)
         # Methods of one option ``energies`` follow each other: their realisations are in memory.
         for name in sorted(names, key=lambda name: self.methods[name].energies or ""):
@@ -425,7 +425,7 @@ class _Bench:
                 measurement.block(k, partial(pairs, self.methods[name].energies))
 
     def readings(self, name: str, exposure: float, n: int) -> RoiReadings:
-        """Of a method at an exposure, from its pieces; one that cannot be read is computed."""
+        """Of a method at an exposure, from the cache; what cannot be read is computed."""
         measurement = self.measurement(name, exposure)
         for k in _blocks(n):
             measurement.block(k, partial(self._pairs(exposure, k), self.methods[name].energies))
@@ -473,7 +473,7 @@ def _run_job(folder: Path, given: _Bench | bytes, job: str, *args: object) -> No
 
 
 def _read(bench: _Bench, exposures: Sequence[float], n: int) -> tuple[list[Record], TaskResult]:
-    """The figures of a task, from the pieces of its jobs."""
+    """The figures of a task, from what its jobs have cached."""
     reader, task, everyone = (
         bench.reader_of(None),
         bench.realisations.task,
@@ -528,11 +528,12 @@ def measured_before(
     Args:
         report: JSON of :func:`recon.evaluate.report.save`; there need be none.
         tasks, exposures_s, n, seed: of the new call.
-        folder: of the pieces.
+        folder: of the cached results.
 
     Returns:
         Names of the methods that were measured at these tasks, exposures and realisations, and
-        whose pieces are all there: they cost nothing. Of others the log says why they are left out.
+        whose results are all cached: they cost nothing. Of others the log says why they are left
+        out.
     """
     try:
         settings = json.loads(report.read_text(encoding="utf-8"))["settings"]
@@ -587,7 +588,7 @@ def _finished(
     seed: int,
     folder: Path,
 ) -> bool:
-    """Whether all pieces of a method are there, of a task that it is measured at."""
+    """Whether all results of a method are cached, of a task that it is measured at."""
     if method.energies is not None and not task.has_energies:
         return True
     store = Store(folder / task.name)

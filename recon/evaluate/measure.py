@@ -1,7 +1,8 @@
-"""What is read of the volumes: every method at every exposure, in pieces that are kept.
+"""What is read of the volumes: every method at every exposure, block after block of
+realisations.
 
-A piece is a block of realisations of one method at one exposure. It keeps numbers only: ROI means,
-channels of the observer, errors, and some flat voxels.
+The readings of a block are cached. They are numbers only: ROI means, channels of the observer,
+errors, and some flat voxels.
 """
 
 from __future__ import annotations
@@ -31,11 +32,12 @@ if TYPE_CHECKING:
     from torchpcct.typing import Floats32
 
 Floats = NDArray[np.float64]
-Piece: TypeAlias = dict[str, Any]
-"""What is kept of some realisations: numbers and arrays by the names that :class:`Readings` has."""
+Block: TypeAlias = dict[str, Any]
+"""What is read of a block of realisations: numbers and arrays by the names that
+:class:`RoiReadings` has."""
 
 BLOCK = 8
-"""Realisations of a piece."""
+"""Realisations of a block."""
 OBSERVERS = ("axial", "volume")
 """Observers by what they look at: the axial slice, or the volume."""
 _CHANNELS = 4
@@ -270,7 +272,7 @@ def check_volume(volume: Tensor, method: Method, reader: Reader, fbp: Tensor) ->
 
 
 def kept_as(method: Method, exposure_s: float, task: Task, seed: int) -> tuple[str, str]:
-    """Where the pieces of a method at an exposure lie in the task's store, and their key."""
+    """Where what is cached of a method at an exposure lies in the task's store, and its key."""
     name = "".join(c if c.isalnum() or c in "-_." else "_" for c in method.name)
     if name.startswith(".") or len(name.encode()) > _LONGEST:
         name = f"{name.strip('.')[:40]}-{hashlib.sha256(method.name.encode()).hexdigest()[:12]}"
@@ -292,40 +294,40 @@ class Measurement:
     ) -> None:
         self.method, self.reader, self.store = method, reader, realisations.store
         self._place, self._key = kept_as(method, exposure_s, realisations.task, realisations.seed)
-        self._pieces: list[Piece] = []
+        self._blocks: list[Block] = []
 
-        def clean() -> Piece:
+        def clean() -> Block:
             pair = [realisations.noise_free(p, exposure_s) for p in (True, False)]
             return _measure_pairs(
                 [pair], method, reader, keep=True, fbp=pair[0].fbp(realisations.kernels[0])
             )
 
-        self._clean = self.store.piece(f"{self._place}/clean", self._key, clean)
-        self._known: Piece | None = None
+        self._clean = self.store.cached(f"{self._place}/clean", self._key, clean)
+        self._known: dict[str, Any] | None = None
         self._adjoints: Tensor | None = None
         if method.network is not None:
             respond = partial(realisations.response, method.network, reader, exposure_s)
-            self._known = self.store.piece(f"{self._place}/response", self._key, respond)
+            self._known = self.store.cached(f"{self._place}/response", self._key, respond)
             self._adjoints = torch.from_numpy(self._known["adjoints"])
 
     def block(self, k: range, pairs: Callable[[], Sequence[Sequence[Simulated]]]) -> None:
         """Realisations ``k``; ``pairs`` gives them, if they have not been measured before."""
 
-        def compute() -> Piece:
+        def compute() -> Block:
             return _measure_pairs(
                 pairs(), self.method, self.reader, keep=k.start == 0, adjoints=self._adjoints
             )
 
-        self._pieces.append(
-            self.store.piece(f"{self._place}/{k.start}-{k.stop}", self._key, compute)
+        self._blocks.append(
+            self.store.cached(f"{self._place}/{k.start}-{k.stop}", self._key, compute)
         )
 
     def readings(self) -> RoiReadings:
         """Of all blocks."""
-        pieces, clean, known = self._pieces, self._clean, self._known
+        blocks, clean, known = self._blocks, self._clean, self._known
         joined = {
-            name: np.concatenate([p[name] for p in pieces])
-            for name in pieces[0]
+            name: np.concatenate([b[name] for b in blocks])
+            for name in blocks[0]
             if name not in ("first", "seconds")
         }
         known_moments = (
@@ -343,9 +345,9 @@ class Measurement:
             clean_square=float(clean["square"][0]),
             clean_rim=float(clean["rim"][0]),
             control=known_moments,
-            first=pieces[0]["first"],
+            first=blocks[0]["first"],
             first_clean=clean["first"],
-            seconds=float(np.mean([p["seconds"] for p in pieces])),
+            seconds=float(np.mean([b["seconds"] for b in blocks])),
             vessel_used=joined["vessel_used"].mean(0),
             warned=joined["warned"].mean(0),
         )
@@ -358,9 +360,9 @@ def _measure_pairs(
     keep: bool,
     adjoints: Tensor | None = None,
     fbp: Tensor | None = None,
-) -> Piece:
-    """A piece of pairs; with ``fbp``, which then is that of the first realisation, the first volume
-    is checked against it."""
+) -> Block:
+    """The readings of pairs; with ``fbp``, which then is that of the first realisation, the first
+    volume is checked against it."""
     lists: dict[str, list[Any]] = {
         name: []
         for name in (

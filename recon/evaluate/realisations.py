@@ -56,7 +56,7 @@ class Realisations:
         kernels: of FBP that methods ask for.
 
     Attributes:
-        prefix: of the names of kept pieces.
+        prefix: of the names of cached results.
     """
 
     prefix = ""
@@ -80,7 +80,7 @@ class Realisations:
     @cached_property
     def ground_truth(self) -> GroundTruth:
         """Of the task."""
-        found: GroundTruth = self.store.piece(f"{self.prefix}facts", self.key, self._ground_truth)
+        found: GroundTruth = self.store.cached(f"{self.prefix}facts", self.key, self._ground_truth)
         return found
 
     def _ground_truth(self) -> GroundTruth:
@@ -127,7 +127,7 @@ class Realisations:
             return together()[kernel]
 
         return {
-            k: self.store.piece(f"{self.prefix}exact_{k}", key, partial(of, k)) for k in kernels
+            k: self.store.cached(f"{self.prefix}exact_{k}", key, partial(of, k)) for k in kernels
         }
 
     def response(
@@ -179,7 +179,7 @@ class Realisations:
             return float(np.sqrt(np.mean(np.square(found))))
 
         name = f"{self.prefix}sigma_{method.kernels[0]}_{exposure_s:g}s_{smooths:g}"
-        return float(self.store.piece(name, f"{self.key} {exposure_s} {smooths}", compute))
+        return float(self.store.cached(name, f"{self.key} {exposure_s} {smooths}", compute))
 
 
 class Simulated:

@@ -1,6 +1,6 @@
 """Jobs in other processes and on other machines, through any :class:`concurrent.futures.Executor`.
 
-A job computes files of a folder (pieces of a :class:`~recon.jobs.store.Store`, volumes);
+A job computes files of a folder (entries of a :class:`~recon.jobs.store.Store`, volumes);
 afterwards the one program that everybody knows reads them and goes on, as if it had computed them
 itself before it was interrupted. So what comes out does not depend on where it was computed, and
 whatever dies, nothing finished is lost.
@@ -827,7 +827,7 @@ def _run(
 
 
 def _keep(folder: Path, files: dict[str, bytes]) -> None:
-    """Write what came back from another disk; a file that is no piece is not replaced by one."""
+    """Write what came back from another disk; a file that no store wrote stays."""
     for name, data in files.items():
         path = folder / name
         if path.suffix == ".npz" and is_foreign(path):

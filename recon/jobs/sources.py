@@ -1,5 +1,5 @@
 """What a result depends on: the sources its module imports, so that a change elsewhere spoils no
-finished piece."""
+cached result."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Finished pieces of a study on disk: each appears whole or not at all, and is reused by the
-next run."""
+"""Cached results on disk: each appears whole or not at all, and is used again by the next run."""
 
 from __future__ import annotations
 
@@ -31,12 +30,13 @@ log = logging.getLogger(__name__)
 
 
 _TRIES = 100
-"""To write a piece, where others clear its folder; it is only kept for later, and a study goes
+"""To write a result, where others clear its folder; it is only cached for later, and a study goes
 on without."""
 
-_MARK = "piece"
-"""What the store wrote carries its own file name under this name: a file is removed, or replaced by
-another piece, only if it says so itself. A folder of pieces may be the user's, or a link to one."""
+_MARK = "cached_as"
+"""What the store wrote carries its own file name under this name: a file is removed only if it
+says so itself, and one that no store wrote is never replaced. The folder of a cache may be the
+user's, or a link to one."""
 _SCAN = re.compile(r"-[0-9a-f]{16}\.h5$")
 """Names of kept scans end so, with a task's fingerprint."""
 
@@ -72,21 +72,21 @@ class Store:
         return path
 
     def has(self, name: str, key: str) -> bool:
-        """Whether a piece was finished with this key."""
+        """Whether a result was cached under this name, with this key."""
         try:
             with np.load(self.folder / (name + ".npz"), allow_pickle=False) as file:
-                return str(file["key"]) == key
+                return _MARK in file and str(file["key"]) == key
         except Exception:  # none, or damaged
             return False
 
-    def piece(self, name: str, key: str, compute: Callable[[], T]) -> T:
-        """What a piece holds: read if it was finished with the same key, else computed and written.
+    def cached(self, name: str, key: str, compute: Callable[[], T]) -> T:
+        """A result: read if it was cached with the same key, else computed and written.
 
-        A file of that name that no store wrote stays, and the piece is not kept.
+        A file of that name that no store wrote stays, and the result is not cached.
 
         Args:
             name: path in the folder, without ending.
-            key: everything that the piece depends on.
+            key: everything that the result depends on.
             compute: gives it, anything that :func:`packed` takes.
         """
         path = self.folder / (name + ".npz")
@@ -100,13 +100,16 @@ class Store:
         elif path.exists():
             try:
                 with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-                    arrays = {k: file[k] for k in file.files if k != _MARK}
-                found, digest = (str(arrays.pop(k, "")) for k in ("key", "sum"))
-                if digest != _digest(found, arrays):
-                    raise ValueError("its content does not match its checksum")
-                if found == key:
-                    return unpacked(arrays)
-                log.info("%s was made with other settings: computed again", path)
+                    arrays = {k: file[k] for k in file.files}
+                if arrays.pop(_MARK, None) is None:
+                    log.info("%s was made by an earlier version: computed again", path)
+                else:
+                    found, digest = (str(arrays.pop(k, "")) for k in ("key", "sum"))
+                    if digest != _digest(found, arrays):
+                        raise ValueError("its content does not match its checksum")
+                    if found == key:
+                        return unpacked(arrays)
+                    log.info("%s was made with other settings: computed again", path)
             except Exception as error:  # a damaged archive can fail in any way
                 log.warning("%s cannot be read (%s): computed again", path, error)
         arrays = packed(compute())
@@ -180,24 +183,24 @@ def was_kept(path: Path) -> bool:
 
 T = TypeVar("T")
 Step = tuple[Callable[..., object], Iterable[tuple[object, ...]]]
-"""A function of a module and the calls of it that are independent, for :meth:`Pieces.ahead`."""
+"""A function of a module and the calls of it that are independent, for :meth:`StudyCache.ahead`."""
 
 
-class Pieces:
-    """Finished parts of one study, of whatever kind, so that the same command goes on after an
-    interruption.
+class StudyCache:
+    """The cache of one study: results of its finished parts, of whatever kind, so that the same
+    command goes on after an interruption.
 
-    A piece is used again only with the same settings and the same source (and weights) of all that
-    the study imports: a result never mixes two versions of them. Unlike those of a :class:`Store`
-    that a study fills on purpose, they are of no use once the report stands: :meth:`clear` takes
-    them away.
+    A result is used again only with the same settings and the same source (and weights) of all
+    that the study imports: a report never mixes two versions of them. Unlike those of a
+    :class:`Store` that a study fills on purpose, they are of no use once the report stands:
+    :meth:`clear` takes them away.
 
     Args:
-        folder: of the study's results, where they lie in ``pieces``; None: nothing is kept.
+        folder: of the study's results, where they lie in ``cache``; None: nothing is cached.
         settings: of the study, a dataclass.
     """
 
-    FOLDER = "pieces"
+    FOLDER = "cache"
 
     def __init__(self, folder: str | Path | None, settings: object) -> None:
         self._store = None if folder is None else Store(Path(folder) / self.FOLDER)
@@ -209,28 +212,28 @@ class Pieces:
         """What ``compute`` gives, or gave before: anything that :func:`packed` takes.
 
         Raises:
-            ValueError: a name that was asked for already, which would give the other piece.
+            ValueError: a name that was asked for already, which would give the other result.
         """
         if self._prefix + name in self._asked:
             raise ValueError(
-                f"two pieces of a study have the name {self._prefix + name!r}: name one of them "
-                "otherwise"
+                f"two cached results of a study have the name {self._prefix + name!r}: name one "
+                "of them otherwise"
             )
         self._asked.add(self._prefix + name)
         if self._store is None:
             return compute()
-        found: T = self._store.piece(self._prefix + name, self._key, compute)
+        found: T = self._store.cached(self._prefix + name, self._key, compute)
         return found
 
     def ahead(self, function: Callable[..., object], calls: Iterable[tuple[object, ...]]) -> None:
-        """Let other processes compute pieces of calls that are independent, before this one reads
-        them one by one.
+        """Let other processes compute and cache the results of calls that are independent, before
+        this one reads them one by one.
 
-        Nothing without an executor (:mod:`recon.jobs.execute`), or where nothing is kept.
+        Nothing without an executor (:mod:`recon.jobs.execute`), or where nothing is cached.
 
         Args:
-            function: of a module; called as ``function(settings, pieces, *call)`` it computes
-                pieces as the study does.
+            function: of a module; called as ``function(settings, cache, *call)`` it caches its
+                results as the study does.
             calls: texts and numbers, which also name the job.
         """
         executor = execute.current()
@@ -241,7 +244,7 @@ class Pieces:
             self._left(function, calls),
             store.folder,
             executor,
-            finished=lambda job: store.piece(self._done(job), key, dict),
+            finished=lambda job: store.cached(self._done(job), key, dict),
         )
 
     def plan(self, *steps: Step) -> None:
@@ -274,23 +277,23 @@ class Pieces:
         return [j for j in jobs if store is None or not store.has(self._done(j), self._key)]
 
     def _done(self, job: execute.Job) -> str:
-        """The piece that says that a job is done."""
+        """Name of what is cached to say that a job is done."""
         return f"done/{hashlib.sha256((self._prefix + job.name).encode()).hexdigest()[:12]}"
 
-    def within(self, prefix: str) -> Pieces:
+    def within(self, prefix: str) -> StudyCache:
         """The same, with names that begin with ``prefix/``."""
         other = copy.copy(self)
         other._prefix = f"{self._prefix}{prefix}/"
         return other
 
     def folder(self, name: str) -> Path | None:
-        """For an evaluation that is part of the study and keeps its own pieces; None: nothing is
-        kept."""
+        """For an evaluation that is part of the study and has a cache of its own; None: nothing is
+        cached."""
         return None if self._store is None else self._store.folder / self._prefix / name
 
     @classmethod
     def clear(cls, folder: str | Path) -> None:
-        """Remove the pieces of a finished study, and nothing else that lies there."""
+        """Remove what a finished study has cached, and nothing else that lies there."""
         if (Path(folder) / cls.FOLDER).is_dir():
             Store(Path(folder) / cls.FOLDER).clear()
 
@@ -302,9 +305,9 @@ def _ahead(
     function: Callable[..., object],
     call: tuple[object, ...],
 ) -> None:
-    pieces = Pieces(root.parent, settings)
-    pieces._prefix = prefix
-    function(settings, pieces, *call)
+    cache = StudyCache(root.parent, settings)
+    cache._prefix = prefix
+    function(settings, cache, *call)
 
 
 def _study_digest(settings: object) -> str:
@@ -315,7 +318,7 @@ def _study_digest(settings: object) -> str:
 
 
 def packed(value: object) -> dict[str, Array]:
-    """Arrays, and under ``tree`` the JSON text of what they make up, for :meth:`Store.piece`.
+    """Arrays, and under ``tree`` the JSON text of what they make up, for :meth:`Store.cached`.
 
     Args:
         value: None, truth values, numbers, texts, arrays, tensors, dataclasses of this software
@@ -338,7 +341,7 @@ def _packed(value: object, arrays: dict[str, Array]) -> object:
             value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
         )
         if arrays[name].dtype.hasobject:
-            raise TypeError("a piece of a study cannot hold an array of Python objects")
+            raise TypeError("a cached result cannot hold an array of Python objects")
         kinds = {torch.Tensor: "tensor", np.ndarray: "array"}
         return {
             next((text for kind, text in kinds.items() if isinstance(value, kind)), "scalar"): name
@@ -355,7 +358,7 @@ def _packed(value: object, arrays: dict[str, Array]) -> object:
     if is_dataclass(kind) and kind.__module__.startswith(("torchpcct.", "recon.")):
         parts = {f.name: _packed(getattr(value, f.name), arrays) for f in fields(kind) if f.init}
         return {"made": [kind.__module__, kind.__qualname__, parts]}
-    raise TypeError(f"a piece of a study cannot hold a {kind.__module__}.{kind.__qualname__}")
+    raise TypeError(f"a cached result cannot hold a {kind.__module__}.{kind.__qualname__}")
 
 
 def unpacked(arrays: Mapping[str, Array]) -> Any:

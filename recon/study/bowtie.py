@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from recon.analytic.fbp import fbp
 from recon.evaluate.experiment import evaluate
 from recon.evaluate.tasks import read_task
-from recon.jobs.store import Pieces, Step
+from recon.jobs.store import Step, StudyCache
 from recon.study.paper import published as paper
 from recon.study.report import Check, around
 from recon.study.study import Measured, Progress, StudySettings, silent
@@ -170,15 +170,15 @@ class BowtieSettings(StudySettings):
 def measure(
     settings: BowtieSettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
-    """Dose, noise, and the plaque by FBP and MBIR, in resumable pieces."""
-    s, pieces = settings, Pieces(folder, settings)
+    """Dose, noise, and the plaque by FBP and MBIR; finished parts are cached."""
+    s, cache = settings, StudyCache(folder, settings)
     data: JsonObject = {}
     scenes = phantoms()
 
     scanners = wide_scanners(8)
     data["transmission"] = transmission(scanners)
-    pieces.ahead(*_step())
-    doses: dict[str, dict[str, CtdiDose]] = _kept(s, pieces, "ctdi")
+    cache.ahead(*_step())
+    doses: dict[str, dict[str, CtdiDose]] = _kept(s, cache, "ctdi")
     progress("dose", 0.3)
     data["ctdi_ratios"] = {k: ratios(v) for k, v in doses.items()}
     more = ("total_peripheral", "total_central", "weighted", "weighted_error")
@@ -191,24 +191,24 @@ def measure(
     }
     maps = {}
     for k, name in enumerate(("ctdi", "thorax")):
-        maps[name] = _kept(s, pieces, f"map_{name}")
+        maps[name] = _kept(s, cache, f"map_{name}")
         progress("dose", 0.3 + 0.3 * (k + 1))
     data["thorax_dose_ratio"] = {
         t: region_ratio(maps["thorax"], scenes["thorax"], b) for t, b in TISSUES.items()
     }
-    data["patient_dose_ratio"] = _kept(s, pieces, "patient")
+    data["patient_dose_ratio"] = _kept(s, cache, "patient")
     progress("dose", 1.0)
 
     found = {}
     for k, name in enumerate(scenes):
-        found[name] = _kept(s, pieces, f"noise_{name}")
+        found[name] = _kept(s, cache, f"noise_{name}")
         progress("noise", (k + 1) / len(scenes))
     data["noise"] = {name: values for name, (values, _) in found.items()}
 
     saved: dict[str, float] = {
         k: 1.0 / data["ctdi_ratios"][k]["weighted"] for k in ("plane", "total") if k in doses
     }
-    data["combined"] = _combined(s, saved, pieces.folder("evaluate"), progress)
+    data["combined"] = _combined(s, saved, cache.folder("evaluate"), progress)
     images = {name: image for name, (_, image) in found.items()}
     return Measured(s, data, (maps, images))
 
@@ -216,9 +216,9 @@ def measure(
 def plan(settings: BowtieSettings, folder: str | Path | None) -> None:
     """List the jobs that are left: doses and noise, then those of the evaluation; see
     :mod:`recon.study.study`."""
-    pieces = Pieces(folder, settings)
-    pieces.plan(_step())
-    _evaluated(settings, pieces.folder("evaluate"), silent)
+    cache = StudyCache(folder, settings)
+    cache.plan(_step())
+    _evaluated(settings, cache.folder("evaluate"), silent)
 
 
 def _step() -> Step:
@@ -226,8 +226,8 @@ def _step() -> Step:
     return _kept, [(name,) for name in ("ctdi", "patient", *of_scenes)]
 
 
-def _kept(settings: BowtieSettings, pieces: Pieces, name: str) -> Any:
-    """A piece of the study by its name; of the CTDI phantom the doses in its bores, by four
+def _kept(settings: BowtieSettings, cache: StudyCache, name: str) -> Any:
+    """A part of the study by its name, cached; of the CTDI phantom the doses in its bores, by four
     readings of "dose"."""
     s, (kind, _, scene) = settings, name.partition("_")
     asked: dict[str, dict[str, Any]] = {
@@ -264,7 +264,7 @@ def _kept(settings: BowtieSettings, pieces: Pieces, name: str) -> Any:
         grid = phantom_grid(scene, spacing)
         return dose_maps(phantoms()[scene], scanners, grid, s.exposure_s, histories, s.seed)
 
-    return pieces(name, compute)
+    return cache(name, compute)
 
 
 # --- slices ---------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ import torch
 from recon.evaluate.experiment import Evaluation, evaluate
 from recon.evaluate.report import plain, task_sections
 from recon.evaluate.tasks import read_task
-from recon.jobs.store import Pieces
+from recon.jobs.store import StudyCache
 from recon.study.energies import VIEWS, energy_rows
 from recon.study.figures import extent
 from recon.study.paper import published as paper
@@ -97,8 +97,8 @@ def measure(
     """Simulate, reconstruct, measure; see :mod:`recon.study.study`."""
     s = settings
     task = _task(s)
-    pieces = Pieces(folder, settings)
-    found = _evaluated(s, task, pieces.folder("evaluate"), progress)
+    cache = StudyCache(folder, settings)
+    found = _evaluated(s, task, cache.folder("evaluate"), progress)
     records = plain(found.records)
     data = {
         "claim": claim(records),
@@ -109,13 +109,13 @@ def measure(
     }
     if s.energies_views:
         rows = partial(energy_rows, task, views=s.energies_views, progress=progress)
-        data["energies"] = pieces("energies", rows)
+        data["energies"] = cache("energies", rows)
     return Measured(s, data, found)
 
 
 def plan(settings: CompareSettings, folder: str | Path | None) -> None:
     """List the jobs that are left; see :mod:`recon.study.study`."""
-    folder = Pieces(folder, settings).folder("evaluate")
+    folder = StudyCache(folder, settings).folder("evaluate")
     _evaluated(settings, _task(settings), folder, silent)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon.jobs.store import Pieces, Step
+from recon.jobs.store import Step, StudyCache
 from recon.study.report import Check
 from recon.study.study import Measured, Progress, StudySettings, silent
 from torchpcct.scanner import Scanner, SiliconDetector, presets
@@ -87,13 +87,13 @@ T = TypeVar("T")
 def measure(
     settings: DetectorSettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
-    """Follow photons and compute rates, in resumable pieces."""
+    """Follow photons and compute rates; finished parts are cached."""
     s, rng = settings, np.random.default_rng(settings.seed)
-    pieces = Pieces(folder, settings)
+    cache = StudyCache(folder, settings)
 
     def followed(name: str, compute: Callable[[], T]) -> T:
-        """A piece that draws photons; the next one draws on where it ended."""
-        found, after = pieces(name, lambda: (compute(), rng.bit_generator.state))
+        """What ``compute`` gives, cached; the next one draws photons where this one ended."""
+        found, after = cache(name, lambda: (compute(), rng.bit_generator.state))
         rng.bit_generator.state = after
         return found
 
@@ -106,7 +106,7 @@ def measure(
             followed(f"energy_{i}", partial(at_energy, energy, max(1000, s.photons // 4), rng))
         )
         progress("photons followed, energies", (i + 1) / len(ENERGIES_KEV))
-    pieces.ahead(*_pile_ups(s))
+    cache.ahead(*_pile_ups(s))
     data = {
         "counts": counts(),
         "efficiency": efficiency,
@@ -116,7 +116,7 @@ def measure(
             followed(f"sharing_{c:g}", partial(charge_sharing, c, s.photons, rng))
             for c in s.charge_sharing
         ],
-        "pile_up": [_pile_up(s, pieces, t) for t in s.dead_times_ns],
+        "pile_up": [_pile_up(s, cache, t) for t in s.dead_times_ns],
     }
     progress("rates", 1.0)
     return Measured(s, data)
@@ -124,15 +124,17 @@ def measure(
 
 def plan(settings: DetectorSettings, folder: str | Path | None) -> None:
     """List the jobs that are left; see :mod:`recon.study.study`."""
-    Pieces(folder, settings).plan(_pile_ups(settings))
+    StudyCache(folder, settings).plan(_pile_ups(settings))
 
 
 def _pile_ups(s: DetectorSettings) -> Step:
     return _pile_up, [(t,) for t in s.dead_times_ns]
 
 
-def _pile_up(settings: DetectorSettings, pieces: Pieces, dead_time_ns: float) -> dict[str, object]:
-    return pieces(f"pile_up_{dead_time_ns:g}", partial(pile_up, dead_time_ns))
+def _pile_up(
+    settings: DetectorSettings, cache: StudyCache, dead_time_ns: float
+) -> dict[str, object]:
+    return cache(f"pile_up_{dead_time_ns:g}", partial(pile_up, dead_time_ns))
 
 
 # --- efficiency -----------------------------------------------------------------------------------

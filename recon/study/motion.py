@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from recon.analytic.inset import view_motion
-from recon.jobs.store import Pieces, Step
+from recon.jobs.store import Step, StudyCache
 from recon.least_squares.inset_problem import InsetProblem
 from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.mbir.mbir import Mbir
@@ -194,15 +194,15 @@ class MotionImages:
 def measure(
     settings: MotionSettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
-    """Simulate and reconstruct residual motion in both scanners, and compensate the PCCT's, in
-    resumable pieces."""
-    s, pieces, m = settings, Pieces(folder, settings), MotionImages()
+    """Simulate and reconstruct residual motion in both scanners, and compensate the PCCT's;
+    finished parts are cached."""
+    s, cache, m = settings, StudyCache(folder, settings), MotionImages()
     scene, plaque = plaque_scene()
     reference = Reference.of(scene, plaque, inset_grid(plaque, s.voxel_mm))
-    pieces.ahead(*_step(s))
+    cache.ahead(*_step(s))
     data: JsonObject = {}
     for name in SCANNERS:
-        still, moving = _residual(s, m, name, reference, pieces, progress)
+        still, moving = _residual(s, m, name, reference, cache, progress)
         if name == "PCCT":
             path = view_motion(s.motion, moving.geometry, s.rotation_s)
             along = path @ np.array([0.0, math.sin(s.direction), math.cos(s.direction)])
@@ -213,9 +213,9 @@ def measure(
             }
             advance = partial(progress, "compensation")
             m.compensated = compensate(
-                s, still, moving, reference, pieces.within("compensation"), advance
+                s, still, moving, reference, cache.within("compensation"), advance
             )
-    paths = pieces.within("found")
+    paths = cache.within("found")
     data |= {
         "estimates": estimated_paths(s, reference.grid, paths, partial(progress, "estimates")),
         "at_rest": {name: o.measures for name, o in m.at_rest.items()},
@@ -239,7 +239,7 @@ def measure(
 
 def plan(settings: MotionSettings, folder: str | Path | None) -> None:
     """List the jobs that are left; see :mod:`recon.study.study`."""
-    Pieces(folder, settings).plan(_step(settings))
+    StudyCache(folder, settings).plan(_step(settings))
 
 
 def _step(s: MotionSettings) -> Step:
@@ -252,18 +252,18 @@ def _residual(
     m: MotionImages,
     name: str,
     reference: Reference,
-    pieces: Pieces,
+    cache: StudyCache,
     progress: Progress,
 ) -> tuple[Scan, Scan]:
     """Images with residual motion; returns the scans at rest and of the largest motion."""
     grid = reference.grid
-    still = moving = _scan(s, pieces, name, 0.0)
+    still = moving = _scan(s, cache, name, 0.0)
     rest = reference_fbp(still, grid)
     m.at_rest[name] = observe(rest, reference, rest)
     path = view_motion(s.motion, still.geometry, s.rotation_s)
     fractions = s.fractions if name == "PCCT" else s.eid_fractions
     for done, fraction in enumerate(fractions):
-        moving = _scan(s, pieces, name, fraction)
+        moving = _scan(s, cache, name, fraction)
         mean = np.tile(fraction * path.mean(0), (len(path), 1))
         in_place, back = reference_fbp(moving, grid), reference_fbp(moving, grid, mean)
         m.residual[name, fraction] = (
@@ -274,7 +274,7 @@ def _residual(
     return still, moving
 
 
-def _scan(s: MotionSettings, pieces: Pieces, name: str, fraction: float) -> Scan:
+def _scan(s: MotionSettings, cache: StudyCache, name: str, fraction: float) -> Scan:
     scanner = SCANNERS[name](paper.FULL_VIEWS[name] // s.thinning)
     scene, plaque = plaque_scene(motion=s.motion.scaled(fraction))
     run = partial(
@@ -285,7 +285,7 @@ def _scan(s: MotionSettings, pieces: Pieces, name: str, fraction: float) -> Scan
         rotation_s=s.rotation_s,
         duty=duty(scanner, paper.FULL_VIEWS[name]),
     )
-    return pieces.within(name)(f"scan_{fraction:g}", run)
+    return cache.within(name)(f"scan_{fraction:g}", run)
 
 
 # --- what one image yields ------------------------------------------------------------------------
@@ -332,7 +332,7 @@ def compensate(
     still: Scan,
     moving: Scan,
     reference: Reference,
-    pieces: Pieces,
+    cache: StudyCache,
     progress: Callable[[float], None],
 ) -> dict[Key, list[PlaqueImage]]:
     """Reconstruct the noise-free scans of the still and of the moving vessel and their noisy
@@ -379,7 +379,7 @@ def compensate(
             for scan in (still, moving)
         ]
         # Where the vessel is on average no scan tells: in the place of the true mean.
-        seen = pieces(f"path_{seed}", partial(_estimated, scans[1], grid))
+        seen = cache(f"path_{seed}", partial(_estimated, scans[1], grid))
         estimates[ESTIMATED] = seen.numpy() + path.mean(0)
         if problems:
             problems[ESTIMATED] = problems[None].with_motion(estimates[ESTIMATED])
@@ -388,7 +388,7 @@ def compensate(
                 if method == "pwls" and (k > 1 or error):
                     continue
                 run = partial(reconstruct, method, scans[error is not None], error)
-                volume = pieces(f"{method}_{error}_{seed}", run)
+                volume = cache(f"{method}_{error}_{seed}", run)
                 if seed is None and error is None:
                     rest[method] = volume
                 found.setdefault((method, error, seed is not None), []).append(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recon.jobs.store import Pieces
+from recon.jobs.store import StudyCache
 from recon.motion import InsetMotion, PathTooLongError, estimate_motion
 from recon.study.paper import published as paper
 from recon.study.paper.plaque_scan import SCANNERS, duty
@@ -107,14 +107,14 @@ CASES: Mapping[str, Callable[[float, float], tuple[SinusoidalMotion, ...]]] = {
 
 
 def estimated_paths(
-    s: EstimateSettings, grid: VolumeGrid, pieces: Pieces, progress: Callable[[float], None]
+    s: EstimateSettings, grid: VolumeGrid, cache: StudyCache, progress: Callable[[float], None]
 ) -> list[JsonObject]:
     """One row for each case, amplitude and exposure.
 
     Args:
         s: of the study.
         grid: of the inset.
-        pieces: keep scans and estimates.
+        cache: for scans and estimates.
         progress: called with the finished fraction.
 
     Returns:
@@ -135,12 +135,12 @@ def estimated_paths(
     for done, (case, mm) in enumerate(jobs):
         motions = CASES[case](mm, s.rate_bpm)
         short = case.replace(",", "").replace(" ", "-")
-        scan = pieces(f"{short}_{mm:g}", partial(_scan, s, grid, motions, "vessels" in case))
+        scan = cache(f"{short}_{mm:g}", partial(_scan, s, grid, motions, "vessels" in case))
         truth = _truth(motions, scan, s.rotation_s)
         for exposure in s.estimated_exposures_s:
             name = f"{short}_{mm:g}_{exposure:g}"
             seeds = range(s.seed, s.seed + s.estimated_realisations)
-            found = pieces(name, partial(_estimates, scan, grid, exposure * s.thinning, seeds))
+            found = cache(name, partial(_estimates, scan, grid, exposure * s.thinning, seeds))
             row = {"case": case, "mm": mm if motions else 0.0, "exposure_s": exposure}
             rows.append(row | _row(found, None if "apart" in case else truth))
         progress((done + 1) / len(jobs))

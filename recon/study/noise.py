@@ -28,7 +28,7 @@ from scipy import stats
 from torch import Tensor
 
 from recon.analytic.exact_noise import roi_adjoints
-from recon.jobs.store import Pieces
+from recon.jobs.store import StudyCache
 from recon.study.figures import extent, roi_outlines
 from recon.study.paper import published as paper
 from recon.study.paper.plaque_scan import (
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 _BLOCK = 40
-"""Realisations of a piece."""
+"""Realisations whose readings are cached together."""
 _SQUARES = 4
 """Realisations per dose of which every reading's squared deviation is summed: 10⁶ independent
 readings pin the variance of an ROI mean down to some 0.1 %, which a few hundred ROI means do not.
@@ -158,12 +158,12 @@ class Moments:
 def measure(
     settings: NoiseSettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
-    """Simulate, take exact moments, draw realisations, reconstruct a few in full, in resumable
-    pieces."""
-    s, pieces = settings, Pieces(folder, settings)
+    """Simulate, take exact moments, draw realisations, reconstruct a few in full; finished
+    parts are cached."""
+    s, cache = settings, StudyCache(folder, settings)
     scanner, full = presets.pcct(views=s.views), paper.FULL_VIEWS["PCCT"]
     scanned = prepare(
-        s.kernels, s.voxels_mm, plaque_scene(), scanner, full, partial(progress, "simulate"), pieces
+        s.kernels, s.voxels_mm, plaque_scene(), scanner, full, partial(progress, "simulate"), cache
     )
     clean = scanned.clean
     fine = reference_fbp(clean, scanned.fine)
@@ -175,13 +175,13 @@ def measure(
     near, matrix = clean.crop(adjoints.window), adjoints.matrix
     del adjoints
     progress("exact noise", 1.0)
-    means, variances = _realisations(s, near, matrix, expected, pieces, progress)
+    means, variances = _realisations(s, near, matrix, expected, cache, progress)
     m = Moments(scanned, expected, covariance, means, variances)
     exposure = s.table_exposure_s
     full_runs = partial(
         _reconstructions, s, scanned, means[exposure], m.exact(exposure).sd, progress
     )
-    m.images, compared = pieces("full_reconstructions", full_runs)
+    m.images, compared = cache("full_reconstructions", full_runs)
     data = {
         "plan": dict(clean.info["plan"]),
         "rois": scanned.rois.as_dict(),
@@ -213,7 +213,7 @@ def _realisations(
     near: Scan,
     matrix: Tensor,
     expected: Floats,
-    pieces: Pieces,
+    cache: StudyCache,
     progress: Progress,
 ) -> tuple[dict[float, Floats], dict[float, Floats]]:
     """``means`` and ``variances`` of :class:`Moments`, from the noise-free readings that the ROIs
@@ -243,8 +243,7 @@ def _realisations(
             return np.array(values), squares
 
         found = [
-            pieces(f"realisations/{exposure:g}s_{k}", partial(block, k))
-            for k in range(0, n, _BLOCK)
+            cache(f"realisations/{exposure:g}s_{k}", partial(block, k)) for k in range(0, n, _BLOCK)
         ]
         means[exposure] = np.concatenate([values for values, _ in found])
         variances[exposure] = np.sum([squares for _, squares in found], axis=0)

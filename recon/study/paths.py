@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.api import reconstruct
-from recon.jobs.store import Pieces, Step
+from recon.jobs.store import Step, StudyCache
 from recon.motion import InsetMotion
 from recon.study.figures import curve_axes
 from recon.study.motion_estimates import AlongAxis, JumpMotion, motion_or_refusal
@@ -198,15 +198,16 @@ def _blood(rng: np.random.Generator, x: float, y: float) -> Scene:
 def measure(
     settings: PathsSettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
-    """Simulate, estimate and compare, in resumable pieces; more vessels go on where fewer ended."""
+    """Simulate, estimate and compare; finished vessels are cached, so that more of them go on where
+    fewer ended."""
     s, seen = settings, Examples()
-    pieces = _pieces(s, folder)
+    cache = _cache(s, folder)
     rows: list[JsonObject] = []
     vessels = range(s.first, s.first + s.vessels)
-    pieces.ahead(*_step(s))
+    cache.ahead(*_step(s))
     for kind in s.kinds:
         for done, vessel in enumerate(vessels):
-            truth, motions, found, seconds = _path(s, pieces, kind, vessel)
+            truth, motions, found, seconds = _path(s, cache, kind, vessel)
             jump = next((m for m in motions if isinstance(m, JumpMotion)), None)
             for exposure, one, cpu in zip(s.exposures_s, found, seconds, strict=True):
                 row = {"kind": kind, "vessel": vessel, "exposure_s": exposure, "cpu_seconds": cpu}
@@ -214,7 +215,7 @@ def measure(
             if found[0] is not None:
                 seen.examples.setdefault(kind, (truth, found[0]))
             progress(kind, (done + 1) / s.vessels)
-    mbir = pieces("mbir", partial(_mbir_seconds, s))
+    mbir = cache("mbir", partial(_mbir_seconds, s))
     summary = [
         {"kind": kind, "exposure_s": exposure}
         | _together([r for r in rows if (r["kind"], r["exposure_s"]) == (kind, exposure)])
@@ -226,12 +227,12 @@ def measure(
 
 def plan(settings: PathsSettings, folder: str | Path | None) -> None:
     """List the jobs that are left; see :mod:`recon.study.study`."""
-    _pieces(settings, folder).plan(_step(settings))
+    _cache(settings, folder).plan(_step(settings))
 
 
-def _pieces(s: PathsSettings, folder: str | Path | None) -> Pieces:
+def _cache(s: PathsSettings, folder: str | Path | None) -> StudyCache:
     """Each vessel has its own, whatever others are asked for."""
-    return Pieces(folder, replace(s, kinds=tuple(KINDS), vessels=1))
+    return StudyCache(folder, replace(s, kinds=tuple(KINDS), vessels=1))
 
 
 def _step(s: PathsSettings) -> Step:
@@ -239,10 +240,10 @@ def _step(s: PathsSettings) -> Step:
 
 
 def _path(
-    s: PathsSettings, pieces: Pieces, kind: str, vessel: int
+    s: PathsSettings, cache: StudyCache, kind: str, vessel: int
 ) -> tuple[Floats, Motions, list[InsetMotion | None], list[float]]:
-    """The piece of one vessel."""
-    return pieces.within(kind.replace(" ", "_"))(f"{vessel}", partial(_estimated, s, kind, vessel))
+    """What is cached of one vessel."""
+    return cache.within(kind.replace(" ", "_"))(f"{vessel}", partial(_estimated, s, kind, vessel))
 
 
 def _estimated(

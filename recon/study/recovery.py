@@ -15,7 +15,7 @@ import torch
 
 from recon.evaluate.insertion import REFERENCE, ContrastRecovery, InsertedBall, contrast_recovery
 from recon.evaluate.names import check_method
-from recon.jobs.store import Pieces
+from recon.jobs.store import StudyCache
 from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.mbir import Mbir
 from recon.mbir.unrolled import DEFAULT_FIDELITY
@@ -110,14 +110,14 @@ def measure(
     ``noise_scale_hu``: of each exposure.
     """
     s = settings
-    pieces = Pieces(folder, s)
+    cache = StudyCache(folder, s)
     jobs = _pairs(s)
-    pieces.ahead(_realisation, jobs)
-    clean = _clean(s, pieces)
+    cache.ahead(_realisation, jobs)
+    clean = _clean(s, cache)
     found: dict[tuple[float, int], list[dict[str, object]]] = {}
     for k, job in enumerate(jobs):
         progress("realisations", k / len(jobs))
-        found[job] = _realisation(s, pieces, *job, clean=clean)
+        found[job] = _realisation(s, cache, *job, clean=clean)
     progress("realisations", 1.0)
     rows = []
     for exposure in s.exposures_s:
@@ -135,7 +135,7 @@ def measure(
 
 def plan(settings: RecoverySettings, folder: str | Path | None) -> None:
     """List the jobs that are left; see :mod:`recon.study.study`."""
-    Pieces(folder, settings).plan((_realisation, _pairs(settings)))
+    StudyCache(folder, settings).plan((_realisation, _pairs(settings)))
 
 
 def _pairs(s: RecoverySettings) -> list[tuple[float, int]]:
@@ -177,33 +177,33 @@ def _noise_scales(clean: Scan, grid: VolumeGrid, exposures_s: Sequence[float]) -
     return [float(problem.term_of(nothing, e).in_noise_units().unit_hu) for e in exposures_s]
 
 
-def _clean(settings: RecoverySettings, pieces: Pieces) -> Scan:
+def _clean(settings: RecoverySettings, cache: StudyCache) -> Scan:
     """The noise-free scan."""
     scene, _ = plaque_scene()
     scanner = presets.pcct(views=settings.views)
     on = duty(scanner, paper.FULL_VIEWS["PCCT"])
-    scan: Scan = pieces("scan", lambda: acquire(scene, scanner, region=_grid(settings), duty=on))
+    scan: Scan = cache("scan", lambda: acquire(scene, scanner, region=_grid(settings), duty=on))
     return scan
 
 
 def _realisation(
     settings: RecoverySettings,
-    pieces: Pieces,
+    cache: StudyCache,
     exposure_s: float,
     seed: int,
     clean: Scan | None = None,
 ) -> list[dict[str, object]]:
     """All balls and methods in one noise realisation."""
-    rows: list[dict[str, object]] = pieces(
-        f"{exposure_s:g}_{seed}", partial(_rows, settings, pieces, exposure_s, seed, clean)
+    rows: list[dict[str, object]] = cache(
+        f"{exposure_s:g}_{seed}", partial(_rows, settings, cache, exposure_s, seed, clean)
     )
     return rows
 
 
 def _rows(
-    s: RecoverySettings, pieces: Pieces, exposure_s: float, seed: int, clean: Scan | None
+    s: RecoverySettings, cache: StudyCache, exposure_s: float, seed: int, clean: Scan | None
 ) -> list[dict[str, object]]:
-    scan = clean or _clean(s, pieces)
+    scan = clean or _clean(s, cache)
     balls = [InsertedBall(*ball) for ball in s.balls]
     found = contrast_recovery(
         scan.with_noise(exposure_s, seed),

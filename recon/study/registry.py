@@ -126,17 +126,17 @@ def run(
     name: str,
     settings: StudySettings,
     progress: Progress | None = None,
-    pieces: str | Path | None = None,
+    cache: str | Path | None = None,
 ) -> Report:
     """Measure a study and build its report, which is not saved; see :func:`measured`."""
-    return report_of(name, measured(name, settings, progress, pieces))
+    return report_of(name, measured(name, settings, progress, cache))
 
 
 def measured(
     name: str,
     settings: StudySettings,
     progress: Progress | None = None,
-    pieces: str | Path | None = None,
+    cache: str | Path | None = None,
 ) -> Measured:
     """Measure a study.
 
@@ -144,8 +144,8 @@ def measured(
         name: of the study.
         settings: of that study.
         progress: called with the name of the step and its finished fraction.
-        pieces: folder for finished pieces, which the next run of the same settings reuses; None:
-            nothing is kept.
+        cache: folder of the results, in which finished parts are cached; the next run of the same
+            settings uses them again. None: nothing is cached.
 
     Raises:
         ValueError: an unknown study; what the study itself refuses.
@@ -163,11 +163,11 @@ def measured(
     timed = Timed(progress or silent)
     if isinstance(execute.current(), execute.Planner):
         if hasattr(study, "plan"):
-            study.plan(settings, pieces)
+            study.plan(settings, cache)
         raise execute.Planned(
             f"nothing was run: the rest of the study {name} has no jobs, one process computes it"
         )
-    found: Measured = study.measure(settings, timed, pieces)
+    found: Measured = study.measure(settings, timed, cache)
     found.seconds = timed.seconds
     return found
 

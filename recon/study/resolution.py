@@ -27,7 +27,7 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from recon.analytic.exact_noise import roi_covariance
-from recon.jobs.store import Pieces
+from recon.jobs.store import StudyCache
 from recon.study.figures import curve_axes, middle_panel, plaque_panel
 from recon.study.paper import published as paper
 from recon.study.paper.plaque_scan import (
@@ -130,14 +130,14 @@ class Imaged:
 def measure(
     settings: ResolutionSettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
-    """Simulate, blur, segment, measure, in resumable pieces."""
-    pieces = Pieces(folder, settings)
+    """Simulate, blur, segment, measure; finished parts are cached."""
+    cache = StudyCache(folder, settings)
     scene, plaque = plaque_scene()
     seen: dict[str, Imaged] = {}
     entries: dict[str, JsonObject] = {}
     for name in SCANNERS:
         seen[name], entries[name] = _image(
-            name, (scene, plaque), settings, pieces.within(name), partial(progress, name)
+            name, (scene, plaque), settings, cache.within(name), partial(progress, name)
         )
         progress(name, 1.0)
     series = seen["PCCT"].blurred
@@ -160,7 +160,7 @@ def _image(
     name: str,
     bodies: tuple[Scene, Plaque],
     settings: ResolutionSettings,
-    pieces: Pieces,
+    cache: StudyCache,
     progress: Callable[[float], None],
 ) -> tuple[Imaged, dict[str, object]]:
     """One scanner's image and its JSON values: what the two ROIs read, with and without a core;
@@ -174,10 +174,10 @@ def _image(
     )
     full = paper.FULL_VIEWS[name]
     scanned = prepare(
-        [REFERENCE_KERNEL], [REFERENCE_VOXEL_MM], bodies, scanner, full, progress, pieces
+        [REFERENCE_KERNEL], [REFERENCE_VOXEL_MM], bodies, scanner, full, progress, cache
     )
     volume = scanned.fbp(scanned.clean)[0][0]
-    grid, slab = pieces(
+    grid, slab = cache(
         "empty", lambda: _middle_slices(plaque_scene(core_contrast=0.0)[0], plaque, scanner, on)
     )
     truth = Truth.of(scene, plaque)
@@ -193,7 +193,7 @@ def _image(
     # The core's part of the contrast is what goes if the core goes; the rest is blood and fat
     # blurred into the ROIs.
     own = fibrous - core - (empty_fibrous - empty_core)
-    width = pieces("wire", lambda: wire_width(scanner, plaque.position[:2], on))
+    width = cache("wire", lambda: wire_width(scanner, plaque.position[:2], on))
     return Imaged(scanned, volume, series), {
         "roi_hu": (core, fibrous),
         "empty_hu": (empty_core, empty_fibrous),

@@ -6,11 +6,11 @@ A study is a module (or a package that exports the same names) of :mod:`recon.st
 * ``SomeNameSettings(StudySettings)`` of the module ``some_name``, a frozen dataclass that validates
   itself;
 * ``measure(settings, progress=silent, folder=None) -> Measured``, which simulates, reconstructs and
-  measures. It prints nothing and writes nothing, but finished pieces into ``folder``
-  (:mod:`recon.jobs.store`), so that an interrupted study goes on;
-* ``plan(settings, folder)``, where parts of it are jobs (:meth:`recon.jobs.store.Pieces.ahead`):
-  lists those that are left, for a dry run, and computes nothing
-  (:meth:`recon.jobs.store.Pieces.plan`);
+  measures. It prints nothing and writes nothing, but the results of finished parts into the cache
+  of ``folder`` (:mod:`recon.jobs.store`), so that an interrupted study goes on;
+* ``plan(settings, folder)``, where parts of it are jobs
+  (:meth:`recon.jobs.store.StudyCache.ahead`): lists those that are left, for a dry run, and
+  computes nothing (:meth:`recon.jobs.store.StudyCache.plan`);
 * ``figures(measured)``: file name → picture of the report;
 * ``checks(data)``, where there is something to check: the report's figures beside the paper's;
 * ``templates/NAME.md.j2``: the report's text, a template that :mod:`recon.study.report` fills in

@@ -116,7 +116,7 @@ class Bench:
                 "b": (b[0] - dose * b[1]).numpy(),
             }
 
-        found = self.store.piece(f"draws/{dose:g}_{k}", "1", compute)
+        found = self.store.cached(f"draws/{dose:g}_{k}", "1", compute)
         return torch.from_numpy(found["fbp"]), torch.from_numpy(found["b"])
 
     def painted(self, vessel: PaintedVessel, values: dict[str, float]) -> tuple[Tensor, Tensor]:
@@ -161,7 +161,7 @@ class Bench:
 
         found = {
             k: torch.from_numpy(v).float()
-            for k, v in self.store.piece(f"places/{name}", "3", compute).items()
+            for k, v in self.store.cached(f"places/{name}", "3", compute).items()
         }
         share = {
             k: torch.from_numpy(v).float() for k, v in vessel.volume_fractions(self.grid).items()

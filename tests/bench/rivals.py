@@ -103,7 +103,7 @@ class Methods:
         b = self.bench
         middle = [n // 2 for n in b.grid.shape]
         fbp = InsetFbp(b.clean, [b.grid], [kernel])
-        found = b.store.piece(
+        found = b.store.cached(
             f"covariance_{kernel}",
             "1",
             lambda: {"c": voxel_covariance(b.clean, fbp, 1.0, middle).numpy()},

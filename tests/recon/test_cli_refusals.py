@@ -282,14 +282,14 @@ def test_folders_that_cannot_be_written_are_refused(tmp_path, monkeypatch):
         require_writable(tmp_path)
 
 
-def test_damaged_pieces_are_computed_again(tmp_path, monkeypatch):
-    """Of 600 damaged pieces 5 stopped the study, and 2 came back incomplete."""
+def test_damaged_results_are_computed_again(tmp_path, monkeypatch):
+    """Of 600 damaged files 5 stopped the study, and 2 came back incomplete."""
     monkeypatch.setattr(os, "fsync", lambda handle: None)  # a disk is slow, and not what is tested
     arrays = {"a": np.arange(7.0), "b": np.ones((2, 3), np.float32)}
     store = Store(tmp_path)
-    store.piece("p", "key", lambda: arrays)
+    store.cached("p", "key", lambda: arrays)
     good = (tmp_path / "p.npz").read_bytes()
-    assert store.piece("p", "key", pytest.fail)["a"].tolist() == list(range(7))
+    assert store.cached("p", "key", pytest.fail)["a"].tolist() == list(range(7))
     rng = np.random.default_rng(0)
     for trial in range(600):
         content = bytearray(good)
@@ -303,7 +303,7 @@ def test_damaged_pieces_are_computed_again(tmp_path, monkeypatch):
                 0, 256, len(content[at : at + 40]), dtype=np.uint8
             ).tobytes()
         (tmp_path / "p.npz").write_bytes(bytes(content))
-        found = store.piece("p", "key", lambda: arrays)
+        found = store.cached("p", "key", lambda: arrays)
         assert sorted(found) == ["a", "b"]
         assert all(np.array_equal(found[k], arrays[k]) for k in arrays)
     # A sound archive that lacks a part, and one with another value.
@@ -316,8 +316,8 @@ def test_damaged_pieces_are_computed_again(tmp_path, monkeypatch):
         {**parts, "a0": parts["a0"] + 1e-12},
     ):
         np.savez(tmp_path / "p.npz", **seal, **other)
-        assert sorted(store.piece("p", "key", lambda: arrays)) == ["a", "b"]
-        assert np.array_equal(store.piece("p", "key", pytest.fail)["a"], arrays["a"])
+        assert sorted(store.cached("p", "key", lambda: arrays)) == ["a", "b"]
+        assert np.array_equal(store.cached("p", "key", pytest.fail)["a"], arrays["a"])
 
 
 def test_a_package_that_nobody_can_write_names_numbas_variable(monkeypatch):

@@ -37,7 +37,7 @@ writers = {
     "s.h5": scan.save,
     "o.h5": objects,
     "w.safetensors": lambda path: write_tensors(path, "k", numbers, {}),
-    "p": lambda path: Store(folder).piece("p", "", lambda: {"a": rng.random(40000)}),
+    "p": lambda path: Store(folder).cached("p", "", lambda: {"a": rng.random(40000)}),
 }
 for size in (600, 5000, 40000):
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
@@ -84,21 +84,21 @@ def test_a_study_outlives_another_one_that_clears_the_same_folder(tmp_path, monk
 
     def clear():
         while not done.wait(0.001):
-            Store(tmp_path / "pieces").clear()
+            Store(tmp_path / "cache").clear()
 
     other = threading.Thread(target=clear)
     other.start()
     try:
-        store = Store(tmp_path / "pieces")
+        store = Store(tmp_path / "cache")
         found = [
-            store.piece(f"deep/{k % 3}", str(k), lambda k=k: {"a": np.full(9, k)})["a"][0]
+            store.cached(f"deep/{k % 3}", str(k), lambda k=k: {"a": np.full(9, k)})["a"][0]
             for k in range(150)
         ]
     finally:
         done.set()
         other.join()
     assert found == list(range(150))
-    Store(tmp_path / "pieces").clear()
+    Store(tmp_path / "cache").clear()
     assert list(tmp_path.iterdir()) == []
 
 

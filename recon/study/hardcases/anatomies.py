@@ -23,7 +23,7 @@ from torch import Tensor
 from recon.evaluate.anatomies import TISSUES_HU, Anatomy, anatomy
 from recon.evaluate.tasks import with_painted, without_inset
 from recon.jobs.execute import captured_warnings
-from recon.jobs.store import Pieces
+from recon.jobs.store import StudyCache
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.recovery import recovered_contrast
 from torchpcct.scan import Scan
@@ -63,7 +63,7 @@ def anatomy_rows(
     methods: Sequence[str],
     reconstruct: Reconstruct,
     kind: Callable[[str], str],
-    pieces: Pieces,
+    cache: StudyCache,
 ) -> list[dict[str, object]]:
     """A row for each method, without noise and as the mean over draws of it: ``anatomy``,
     ``title``, ``method``, ``draws`` (0: without noise), ``recovered`` (None if refused), ``soft``,
@@ -76,7 +76,7 @@ def anatomy_rows(
         methods: of :data:`METHODS`.
         reconstruct: by ``"soft"`` (FBP) or a method.
         kind: a warning without its figures.
-        pieces: keep what is finished.
+        cache: for what is finished.
     """
     what, rows = anatomy(name), []
     with_it, without = (_scanned(what, clean, grid, feature=f) for f in (True, False))
@@ -97,12 +97,12 @@ def anatomy_rows(
         ) -> tuple[float | None, list[str]]:
             return _recovered(pairs, grid, method, truth, reconstruct, kind)
 
-        soft, refusal = pieces(f"{name}_{number}_soft", partial(shown, "soft"))
+        soft, refusal = cache(f"{name}_{number}_soft", partial(shown, "soft"))
         if soft is None:
             raise ValueError(f"soft FBP, the reference, refuses the anatomy {name}: {refusal[0]}")
         for method in methods:
-            piece = f"{name}_{number}_{method.replace(':', '_')}"
-            recovered, messages = pieces(piece, partial(shown, method))
+            entry = f"{name}_{number}_{method.replace(':', '_')}"
+            recovered, messages = cache(entry, partial(shown, method))
             rows.append(
                 {
                     "anatomy": name,

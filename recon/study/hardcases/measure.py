@@ -22,7 +22,7 @@ import torch
 from recon import reconstruct
 from recon.evaluate.anatomies import ANATOMIES
 from recon.jobs.execute import captured_warnings
-from recon.jobs.store import Pieces, Step
+from recon.jobs.store import Step, StudyCache
 from recon.study.hardcases.anatomies import METHODS as ANATOMY_METHODS
 from recon.study.hardcases.anatomies import anatomy_rows
 from recon.study.hardcases.cases import (
@@ -173,24 +173,22 @@ def measure(
     scan; either is None if refused). ``anatomies``: rows of
     :func:`recon.study.hardcases.anatomies.anatomy_rows`.
     """
-    pieces = Pieces(folder, settings)
-    bases = {
-        name: _BASES[name](settings, pieces.within(name), progress) for name in _used(settings)
-    }
+    cache = StudyCache(folder, settings)
+    bases = {name: _BASES[name](settings, cache.within(name), progress) for name in _used(settings)}
     sound, cases, anatomies = _steps(settings)
-    pieces.ahead(*sound)
+    cache.ahead(*sound)
     for k, (name, method) in enumerate(_pairs(settings)):
         bases[name].sound(method)
         progress("sound scans", (k + 1) / len(sound))
-    pieces.ahead(*cases)
+    cache.ahead(*cases)
     rows = []
     for k, name in enumerate(settings.cases):
-        rows += _case(settings, pieces, name, bases[CASES[name].base])
+        rows += _case(settings, cache, name, bases[CASES[name].base])
         progress("cases", (k + 1) / len(settings.cases))
     diseased = []
-    pieces.ahead(*anatomies)
+    cache.ahead(*anatomies)
     for k, name in enumerate(settings.anatomies):
-        diseased += _anatomy(settings, pieces, name, bases["plaque"])
+        diseased += _anatomy(settings, cache, name, bases["plaque"])
         progress("anatomies", (k + 1) / len(settings.anatomies))
     counts = Counter(row["verdict"] for row in rows)
     data = {
@@ -205,7 +203,7 @@ def measure(
 
 def plan(settings: HardcasesSettings, folder: str | Path | None) -> None:
     """List the jobs that are left; see :mod:`recon.study.study`."""
-    Pieces(folder, settings).plan(*_steps(settings))
+    StudyCache(folder, settings).plan(*_steps(settings))
 
 
 def _steps(settings: HardcasesSettings) -> tuple[Step, Step, Step]:
@@ -236,7 +234,7 @@ class _Base:
         scene, clean, noisy, grid, truth: of it.
         simulate, truth_of: of another scene.
         plaque: in it, or None.
-        pieces: keep what they give.
+        cache: for what they give.
     """
 
     scene: Scene
@@ -247,7 +245,7 @@ class _Base:
     simulate: Callable[[Scene], Scan]
     truth_of: Callable[[Scene], torch.Tensor]
     plaque: Plaque | None
-    pieces: Pieces
+    cache: StudyCache
     _sound: dict[str, tuple[torch.Tensor, list[str], float]] = field(default_factory=dict)
 
     def sound(self, method: str) -> tuple[torch.Tensor, list[str], float]:
@@ -260,11 +258,11 @@ class _Base:
             return volume.data, [*volume.report.get("warnings", ()), *messages], noise
 
         if method not in self._sound:
-            self._sound[method] = self.pieces(f"sound_{method}", compute)
+            self._sound[method] = self.cache(f"sound_{method}", compute)
         return self._sound[method]
 
 
-def _plaque_base(settings: HardcasesSettings, pieces: Pieces, progress: Progress) -> _Base:
+def _plaque_base(settings: HardcasesSettings, cache: StudyCache, progress: Progress) -> _Base:
     scene, plaque = plaque_scene(vessel_length=_GRID_MM[0] - 0.2)
     scanner = presets.pcct(views=settings.views)
     scanner = scanner.replace(geometry=replace(scanner.geometry, rows=_ROWS))
@@ -283,25 +281,25 @@ def _plaque_base(settings: HardcasesSettings, pieces: Pieces, progress: Progress
         )
 
     truth_of = partial(_truth, scanner=scanner, grid=grid)
-    clean = pieces("scan", partial(simulate, scene))
+    clean = cache("scan", partial(simulate, scene))
     noisy = clean.with_noise(settings.exposure_s, settings.seed)
-    truth = pieces("truth", partial(truth_of, scene))
-    return _Base(scene, clean, noisy, grid, truth, simulate, truth_of, plaque, pieces)
+    truth = cache("truth", partial(truth_of, scene))
+    return _Base(scene, clean, noisy, grid, truth, simulate, truth_of, plaque, cache)
 
 
-def _body_base(settings: HardcasesSettings, pieces: Pieces, progress: Progress) -> _Base:
+def _body_base(settings: HardcasesSettings, cache: StudyCache, progress: Progress) -> _Base:
     scene = thorax()
-    clean = pieces("scan", partial(body_scan, scene))
+    clean = cache("scan", partial(body_scan, scene))
     noisy = clean.with_noise(NOISE_FREE_EXPOSURE_S, settings.seed)
-    return _Base(scene, clean, noisy, GRID, body_truth(scene), body_scan, body_truth, None, pieces)
+    return _Base(scene, clean, noisy, GRID, body_truth(scene), body_scan, body_truth, None, cache)
 
 
-def _cone_base(settings: HardcasesSettings, pieces: Pieces, progress: Progress) -> _Base:
+def _cone_base(settings: HardcasesSettings, cache: StudyCache, progress: Progress) -> _Base:
     scene = balls()
-    clean = pieces("scan", partial(cone_scan, scene))
+    clean = cache("scan", partial(cone_scan, scene))
     noisy = clean.with_noise(NOISE_FREE_EXPOSURE_S, settings.seed)
     return _Base(
-        scene, clean, noisy, CONE_GRID, cone_truth(scene), cone_scan, cone_truth, None, pieces
+        scene, clean, noisy, CONE_GRID, cone_truth(scene), cone_scan, cone_truth, None, cache
     )
 
 
@@ -325,24 +323,24 @@ def _reconstruct(scan: Scan, grid: VolumeGrid, method: str) -> Volume:
     )
 
 
-def _sound(settings: HardcasesSettings, pieces: Pieces, name: str, method: str) -> None:
+def _sound(settings: HardcasesSettings, cache: StudyCache, name: str, method: str) -> None:
     """What a method makes of the sound scan of this name."""
-    _BASES[name](settings, pieces.within(name), silent).sound(method)
+    _BASES[name](settings, cache.within(name), silent).sound(method)
 
 
 def _case(
-    settings: HardcasesSettings, pieces: Pieces, name: str, base: _Base | None = None
+    settings: HardcasesSettings, cache: StudyCache, name: str, base: _Base | None = None
 ) -> list[dict[str, object]]:
     """A row for each method; without ``base``, its sound scan, this is computed or read first."""
-    base = base or _BASES[CASES[name].base](settings, pieces.within(CASES[name].base), silent)
-    pieces = pieces.within(f"case_{name}")
+    base = base or _BASES[CASES[name].base](settings, cache.within(CASES[name].base), silent)
+    cache = cache.within(f"case_{name}")
     case, clean, noisy, truth = CASES[name], base.clean, base.noisy, base.truth
     seen, lost = torch.ones(base.grid.shape).bool(), case.noise
     if case.scene is not None:
         scene = case.scene(base.plaque or Plaque())
-        clean = pieces("scan", partial(base.simulate, scene))
+        clean = cache("scan", partial(base.simulate, scene))
         noisy = clean.with_noise(noisy.exposure_s or NOISE_FREE_EXPOSURE_S, settings.seed)
-        truth = pieces("truth", partial(base.truth_of, scene))
+        truth = cache("truth", partial(base.truth_of, scene))
         grid = base.grid
         if grid.ndim == 2:
             grid = VolumeGrid((1, *grid.shape), (1.0, *grid.spacing), (0.0, *grid.center))
@@ -358,22 +356,22 @@ def _case(
         volume = _tried(scan, base.grid, "soft")[0]
         return None if volume is None else _rms((volume.data - truth)[seen])
 
-    soft = pieces("soft", soft_error)
+    soft = cache("soft", soft_error)
     rows = []
     for method in settings.methods:
         if method not in _METHODS[case.base] or (method == "tissues" and not case.tissues):
             continue
         run = partial(_row, scan, base, method, case, truth, seen, lost, soft)
-        row = pieces(method, run)
+        row = cache(method, run)
         rows.append({"case": name, "base": case.base, "title": case.title, "method": method, **row})
     return rows
 
 
 def _anatomy(
-    settings: HardcasesSettings, pieces: Pieces, name: str, base: _Base | None = None
+    settings: HardcasesSettings, cache: StudyCache, name: str, base: _Base | None = None
 ) -> list[dict[str, object]]:
     """See :func:`recon.study.hardcases.anatomies.anatomy_rows`."""
-    base = base or _BASES["plaque"](settings, pieces.within("plaque"), silent)
+    base = base or _BASES["plaque"](settings, cache.within("plaque"), silent)
     return anatomy_rows(
         name,
         base.clean,
@@ -384,7 +382,7 @@ def _anatomy(
         methods=settings.anatomy_methods,
         reconstruct=_reconstruct,
         kind=_kind,
-        pieces=pieces.within(f"anatomy_{name}"),
+        cache=cache.within(f"anatomy_{name}"),
     )
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.analytic.inset import InsetFbp
-from recon.jobs.store import Pieces
+from recon.jobs.store import StudyCache
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.geometry import VolumeGrid
 from torchpcct.metrics.placement import RoiPair, place_rois
@@ -111,10 +111,10 @@ def prepare(
     scanner: Scanner,
     full_views: int,
     progress: Callable[[float], None] | None = None,
-    pieces: Pieces | None = None,
+    cache: StudyCache | None = None,
 ) -> PlaqueScan:
-    """Simulate the noise-free scan of a plaque in its scene and place grids and ROIs; ``pieces``
-    keep the scan.
+    """Simulate the noise-free scan of a plaque in its scene and place grids and ROIs; the scan
+    is kept in ``cache``.
 
     Raises:
         ValueError: ROIs that come out empty; an inset outside the field of view.
@@ -125,8 +125,8 @@ def prepare(
     rois = place_rois(bodies, axial_grid(fine.center))
     region = enclosing([*grids, fine])
     on = duty(scanner, full_views)
-    keep = pieces or Pieces(None, None)
-    clean = keep(
+    cache = cache or StudyCache(None, None)
+    clean = cache(
         "scan", lambda: acquire(bodies, scanner, region=region, duty=on, progress=progress)
     )
     return PlaqueScan(

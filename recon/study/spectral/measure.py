@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from recon.analytic.exact_noise import functional_covariance
-from recon.jobs.store import Pieces, Step
+from recon.jobs.store import Step, StudyCache
 from recon.least_squares.basis_problem import BasisProblem
 from recon.least_squares.qggmrf import DEFAULT_PRIOR
 from recon.study.figures import extent
@@ -165,22 +165,22 @@ class PictureVolumes:
 def measure(
     settings: SpectralSettings, progress: Progress = silent, folder: str | Path | None = None
 ) -> Measured:
-    """Scan, decompose, reconstruct, label, in resumable pieces."""
-    s, pieces, spent = settings, Pieces(folder, settings), time.process_time()
+    """Scan, decompose, reconstruct, label; finished parts are cached."""
+    s, cache, spent = settings, StudyCache(folder, settings), time.process_time()
 
-    scan = SpectralScan(s, lambda fraction: progress("simulate", fraction), pieces=pieces)
+    scan = SpectralScan(s, lambda fraction: progress("simulate", fraction), cache=cache)
     data: JsonObject = {"plan": scan.clean.info["plan"]}
     progress("simulate", 1.0)
     noise_free = scan.fbp.images(scan.exact.line_integrals)[0][0]
     lines, volumes, data["rays"] = [], [], []
-    pieces.ahead(*_step(s))
+    cache.ahead(*_step(s))
     for k in range(s.realisations):
-        volume, used, statistics = _noisy(s, pieces, k, scan)
+        volume, used, statistics = _noisy(s, cache, k, scan)
         data["rays"].append(statistics)
         volumes.append(volume)
         lines += used
         progress("decompose noisy scans", (k + 1) / (s.realisations + 1))
-    low = pieces("noisy_low", lambda: scan.noisy(LOW_EXPOSURE_S, s.seed, _LOW_EXPOSURE_STEP)[1])
+    low = cache("noisy_low", lambda: scan.noisy(LOW_EXPOSURE_S, s.seed, _LOW_EXPOSURE_STEP)[1])
     data["rays"].append(low)
     images = Images(noise_free, torch.stack(volumes))
     progress("decompose noisy scans", 1.0)
@@ -195,14 +195,14 @@ def measure(
     progress("tissue maps", 1.0)
     if lines:
         data["mbir"], data["dice"]["joint MBIR"] = _mbir(
-            scan, tissues, lines, images, data["vmi"], pieces, progress
+            scan, tissues, lines, images, data["vmi"], cache, progress
         )
         progress("joint MBIR", 1.0)
     if s.calibration_views:
         costs = partial(
             calibration_costs, s, tissues, lambda fraction: progress("wrong calibrations", fraction)
         )
-        data["calibration"] = pieces("calibration", costs)
+        data["calibration"] = cache("calibration", costs)
     residual = {
         name: float(np.abs(pe_pvc().residual(name)).max())
         for name in ("necrotic_core", "blood_iodine")
@@ -213,7 +213,7 @@ def measure(
 
 def plan(settings: SpectralSettings, folder: str | Path | None) -> None:
     """List the jobs that are left; see :mod:`recon.study.study`."""
-    Pieces(folder, settings).plan(_step(settings))
+    StudyCache(folder, settings).plan(_step(settings))
 
 
 def _step(s: SpectralSettings) -> Step:
@@ -221,16 +221,16 @@ def _step(s: SpectralSettings) -> Step:
 
 
 def _noisy(
-    s: SpectralSettings, pieces: Pieces, k: int, scan: SpectralScan | None = None
+    s: SpectralSettings, cache: StudyCache, k: int, scan: SpectralScan | None = None
 ) -> tuple[Tensor, list[Tensor], dict[str, object]]:
     """FBP of a realisation, its line integrals if MBIR needs them, and figures of its rays."""
-    scan = scan or SpectralScan(s, pieces=pieces)
+    scan = scan or SpectralScan(s, cache=cache)
 
     def draw() -> tuple[Tensor, list[Tensor], dict[str, object]]:
         noisy, statistics = scan.noisy(s.exposure_s, s.seed + k)
         return scan.fbp.images(noisy)[0][0], [noisy] if k < s.mbir_realisations else [], statistics
 
-    return pieces(f"noisy_{k}", draw)
+    return cache(f"noisy_{k}", draw)
 
 
 def _curve(curve: VmiCurve) -> dict[str, object]:
@@ -293,7 +293,7 @@ def _mbir(
     lines: list[Tensor],
     images: Images,
     curves: JsonObject,
-    pieces: Pieces,
+    cache: StudyCache,
     progress: Progress,
 ) -> tuple[JsonObject, list[JsonObject]]:
     """Joint MBIR at every noise level, and its scores; volumes of the first realisation go to
@@ -316,7 +316,7 @@ def _mbir(
         for k, noisy in enumerate(lines if level else lines[:1]):
             data = exact + level * (noisy - exact)
             solve = partial(problem.solve, data, scan.window, dose=dose, tolerance=1.0)
-            volume, report = pieces(f"mbir_{level:g}_{k}", solve)
+            volume, report = cache(f"mbir_{level:g}_{k}", solve)
             found.append(volume)
             reports.append({"noise": level, **report})
             progress("joint MBIR", len(reports) / steps)

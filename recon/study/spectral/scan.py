@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from recon.analytic.inset import InsetFbp
-from recon.jobs.store import Pieces
+from recon.jobs.store import StudyCache
 from recon.study.paper.plaque_scan import duty, inset_grid
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.detector_window import footprint
@@ -86,7 +86,7 @@ class SpectralScan:
         detector: another one than the preset's.
         full_views: of the complete scan that ``settings.views`` stand for, each with its turn of
             the gantry; None: the scan has no more.
-        pieces: keep the noise-free scan and its decomposition.
+        cache: for the noise-free scan and its decomposition.
 
     Attributes:
         scene, plaque, scanner: what is scanned.
@@ -101,9 +101,9 @@ class SpectralScan:
         progress: Callable[[float], None] | None = None,
         detector: SiliconDetector | None = None,
         full_views: int | None = None,
-        pieces: Pieces | None = None,
+        cache: StudyCache | None = None,
     ) -> None:
-        self.settings, self._pieces = settings, pieces or Pieces(None, None)
+        self.settings, self._cache = settings, cache or StudyCache(None, None)
         self.scene, self.plaque = plaque_scene()
         self.scanner = presets.pcct(views=settings.views, mode="spectral", detector=detector)
         on = 1.0 if full_views is None else duty(self.scanner, full_views)
@@ -115,7 +115,7 @@ class SpectralScan:
             window = footprint(scan.geometry, self.grid).widened(NOISE_COLUMNS, scan.window)
             return scan.crop(window), window
 
-        self.clean, self.window = self._pieces("scan", run)
+        self.clean, self.window = self._cache("scan", run)
         self.basis = SpectralModel.of(self.scanner, NOISE_FREE_EXPOSURE_S).basis
         self.rois = place_rois(self.scene, axial_grid(self.grid.center))
 
@@ -130,7 +130,7 @@ class SpectralScan:
         # Newton's method squares the error in every step: after one of 1e-3 standard deviations
         # 1e-6 are left.
         run = partial(decompose_scan, self.clean, self.model(NOISE_FREE_EXPOSURE_S), tolerance=1e-3)
-        return self._pieces("exact", run)
+        return self._cache("exact", run)
 
     @cached_property
     def exterior(self) -> Tensor:

@@ -39,7 +39,7 @@ def task(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("pieces")
+    return tmp_path_factory.mktemp("cache")
 
 
 @pytest.fixture(scope="module")

@@ -39,7 +39,7 @@ def task(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("pieces")
+    return tmp_path_factory.mktemp("cache")
 
 
 def halved(scan, grid):
@@ -161,7 +161,7 @@ def test_a_users_denoiser_and_reconstruction(found):
 
 def test_a_second_call_computes_nothing_again(task, folder, found):
     def never(realisation):
-        raise AssertionError("this piece was finished")
+        raise AssertionError("this block was measured before")
 
     again = evaluate(task, ["fbp:soft", Method("mine", never)], n=8, folder=folder)
     assert value(again, "error", "mine", "near the bodies") == value(
@@ -177,11 +177,11 @@ def test_a_changed_task_takes_no_old_results(tmp_path):
     for text in texts:
         (tmp_path / "insert.yaml").write_text(text, encoding="utf-8")
         again = read_task(tmp_path / "insert.yaml")
-        (seen,) = evaluate(again, "fbp:soft", n=8, folder=tmp_path / "pieces").results
+        (seen,) = evaluate(again, "fbp:soft", n=8, folder=tmp_path / "cache").results
         slopes.append(seen.true_hu["lesion"])
     assert slopes[0] < -20.0
     assert slopes[1] > 50.0
-    assert len(list((tmp_path / "pieces").rglob("present-*.h5"))) == 1
+    assert len(list((tmp_path / "cache").rglob("present-*.h5"))) == 1
     assert read_task(tmp_path / "insert.yaml").fingerprint == again.fingerprint
 
 
@@ -331,7 +331,7 @@ def test_names_that_are_paths_stay_within(task, tmp_path):
     assert kept_as(Method("fbp:soft", run_half), 1.0, task, 0)[0] == "fbp_soft/1s"
 
 
-def test_pieces_of_another_seed_method_or_exposure_are_not_taken(task, tmp_path):
+def test_results_of_another_seed_method_or_exposure_are_not_taken(task, tmp_path):
     """A second call with another --seed must compute: its realisations are other ones."""
     first = kept_as(Method("half", run_half), 1.0, task, 0)
     others = [
@@ -340,9 +340,9 @@ def test_pieces_of_another_seed_method_or_exposure_are_not_taken(task, tmp_path)
         kept_as(Method("other", run_half), 1.0, task, 0),
     ]
     store = Store(tmp_path)
-    assert store.piece(first[0], first[1], lambda: {"of": 0}) == {"of": 0}
+    assert store.cached(first[0], first[1], lambda: {"of": 0}) == {"of": 0}
     for k, (place, key) in enumerate(others, start=1):
-        assert store.piece(place, key, lambda k=k: {"of": k}) == {"of": k}
+        assert store.cached(place, key, lambda k=k: {"of": k}) == {"of": k}
 
 
 @pytest.mark.parametrize(
@@ -607,7 +607,7 @@ def test_a_segmented_lesion_is_a_task(voxel_task, task, folder, tmp_path):
     staircase of the voxels."""
     mine, store, there = (
         read_task(voxel_task),
-        Store(tmp_path / "pieces"),
+        Store(tmp_path / "voxels"),
         Store(tmp_path / "analytic"),
     )
     ground_truth, known = mine.ground_truth(store), task.ground_truth(there)

@@ -44,7 +44,7 @@ from recon.evaluate.tasks import read_task
 from recon.jobs import execute
 from recon.jobs.execute import Cluster, Job, LeftOut, Processes, run
 from recon.jobs.sources import _content, _follow, source_digest
-from recon.jobs.store import Pieces
+from recon.jobs.store import StudyCache
 from recon.slabs import reconstruct_to
 from recon.study import registry
 from recon.study.results import differences
@@ -202,7 +202,7 @@ def test_a_study_gives_the_same_report(name, processes, tmp_path):
 
 def run_tiny_with(name, settings, folder):
     made = registry.settings_class(name)(**settings)
-    registry.run(name, made, pieces=folder).save(folder)
+    registry.run(name, made, cache=folder).save(folder)
 
 
 @pytest.mark.extended
@@ -484,7 +484,7 @@ def test_a_signal_ends_evaluate(tmp_path, name):
         text=True,
         env={**os.environ, "PYTHONPATH": path},
     ) as process:
-        wait_until(lambda: list(tmp_path.glob("out/pieces/**/*.h5")))
+        wait_until(lambda: list(tmp_path.glob("out/cache/**/*.h5")))
         children = psutil.Process(process.pid).children(recursive=True)
         process.send_signal(number)
         said = process.communicate(timeout=600)[1]
@@ -850,10 +850,10 @@ def test_a_dry_run_of_a_study_computes_nothing(here, cli, name, monkeypatch):
 
 def test_a_dry_run_leaves_out_what_is_done(here, cli):
     settings = registry.build_settings("detector")
-    pieces = Pieces(here / "x", settings)
+    cache = StudyCache(here / "x", settings)
     function, calls = registry.part("detector")._pile_ups(settings)
-    for job in pieces._left(function, calls[:2]):
-        pieces._store.piece(pieces._done(job), pieces._key, dict)
+    for job in cache._left(function, calls[:2]):
+        cache._store.cached(cache._done(job), cache._key, dict)
     text = cli("study detector --dry-run --out x")
     assert "1 jobs" in text
     assert "pile_up 100.0" in text
@@ -889,8 +889,8 @@ print(*called)
 
 
 @pytest.mark.extended
-def test_a_digest_covers_all_that_a_piece_runs(task, tmp_path):
-    """Every function that is called while a piece is computed stands in a module that the digest
+def test_a_digest_covers_all_that_a_result_needs(task, tmp_path):
+    """Every function that is called while a result is computed stands in a module that the digest
     has read, and the digest reads neither studies nor the command line."""
     (tmp_path / "given").write_bytes(pickle.dumps((task, [method_of(m) for m in METHODS])))
     called = run_python(CALLED, tmp_path / "given", tmp_path / "store").stdout.split()

@@ -1,5 +1,5 @@
-"""Pieces of a study: what goes in comes out, kills lose one piece at most, and nothing of
-another version is used."""
+"""Cached results: what goes in comes out, kills lose one result at most, and nothing of another
+version is used."""
 
 import io
 import json
@@ -17,7 +17,7 @@ from tiny_studies import run_tiny
 
 import recon.jobs.store as store_module
 from recon.jobs import execute
-from recon.jobs.store import Pieces, Store, packed, unpacked
+from recon.jobs.store import Store, StudyCache, packed, unpacked
 from recon.study.noise import RoiStatistics
 from recon.study.results import differences
 from torchpcct import ConeBeam, VolumeGrid, full_turn
@@ -72,28 +72,30 @@ def test_a_scan_comes_back_whole(tmp_path):
 
 def test_what_cannot_be_kept_is_refused():
     for value in (object(), {1: {2}}, np.array([object()]), _Settings()):
-        with pytest.raises(TypeError, match="a piece of a study cannot hold"):
+        with pytest.raises(TypeError, match="a cached result cannot hold"):
             packed(value)
     foreign = {"tree": np.array(json.dumps({"made": ["os", "path", {}]}))}
     with pytest.raises(ValueError, match="not a dataclass of this software"):
         unpacked(foreign)
 
 
-def test_finished_pieces_are_used_again_by_the_same_settings_and_source_only(tmp_path, monkeypatch):
+def test_finished_results_are_used_again_by_the_same_settings_and_source_only(
+    tmp_path, monkeypatch
+):
     computed = []
 
     def run(settings=_Settings(), folder=tmp_path):
-        pieces = Pieces(folder, settings).within("part")
-        return pieces("x", lambda: computed.append(1) or len(computed))
+        cache = StudyCache(folder, settings).within("part")
+        return cache("x", lambda: computed.append(1) or len(computed))
 
     assert (run(), run()) == (1, 1)
     assert run(_Settings(seed=1)) == 2
     monkeypatch.setattr(store_module, "source_digest", lambda: "another version")
     assert run(_Settings(seed=1)) == 3
     assert run(folder=None) == 4
-    Pieces.clear(tmp_path)
+    StudyCache.clear(tmp_path)
     assert list(tmp_path.iterdir()) == []
-    Pieces.clear(tmp_path)  # nothing there: nothing to do
+    StudyCache.clear(tmp_path)  # nothing there: nothing to do
 
 
 def _content(folder):
@@ -105,13 +107,13 @@ def _content(folder):
 
 @pytest.mark.parametrize("linked", [False, True])
 def test_only_what_a_study_wrote_is_ever_removed(tmp_path, linked):
-    """Files of the user in ``OUT/pieces``, also of a kept piece's name and kind, also where it
+    """Files of the user in ``OUT/cache``, also of a cached result's name and kind, also where it
     is a link."""
-    out, pieces = tmp_path / "out", tmp_path / "out" / "pieces"
+    out, cache = tmp_path / "out", tmp_path / "out" / "cache"
     out.mkdir()
     if linked:
         (tmp_path / "mine").mkdir()
-        pieces.symlink_to(tmp_path / "mine", target_is_directory=True)
+        cache.symlink_to(tmp_path / "mine", target_is_directory=True)
     for name in (
         "deep/notes.txt",
         "deep/.part",
@@ -119,7 +121,7 @@ def test_only_what_a_study_wrote_is_ever_removed(tmp_path, linked):
         "other.d/data.npz",
         "deep/x.npz",
     ):
-        path = pieces / name
+        path = cache / name
         (path if name.endswith("/") else path.parent).mkdir(parents=True, exist_ok=True)
         if path.suffix == ".npz":
             np.savez(path, key=np.ones(3), measured=np.arange(5))
@@ -128,12 +130,12 @@ def test_only_what_a_study_wrote_is_ever_removed(tmp_path, linked):
     g = ConeBeam(full_turn(3), 500.0, 900.0, 4, 2, 1.0)
     scan = Scan.from_counts(torch.full(g.shape, 7.0), g, air=9.0)
     for name in ("present.h5", "present-0123456789abcdef.h5"):
-        scan.save(pieces / name)
+        scan.save(cache / name)
     (tmp_path / "elsewhere.txt").write_text("mine")
-    (pieces / "link.txt").symlink_to(tmp_path / "elsewhere.txt")
-    Path(pieces / "link.npz").symlink_to(tmp_path / "elsewhere.txt")
+    (cache / "link.txt").symlink_to(tmp_path / "elsewhere.txt")
+    Path(cache / "link.npz").symlink_to(tmp_path / "elsewhere.txt")
     mine = _content(tmp_path)
-    study = Pieces(out, _Settings())
+    study = StudyCache(out, _Settings())
     for name in ("a", "deep/x", "deep/deeper/y", "link"):
         assert study(name, lambda name=name: name) == name
     store = Store(study.folder("evaluate"))
@@ -141,41 +143,73 @@ def test_only_what_a_study_wrote_is_ever_removed(tmp_path, linked):
     assert Scan.load(store.path("task/present-fedcba9876543210.h5")).geometry == g
     own = {"a.npz", "deep/deeper/y.npz", "evaluate/task/present-fedcba9876543210.h5"}
     assert own <= {
-        name.removeprefix("out/pieces/").removeprefix("mine/") for name in _content(tmp_path)
+        name.removeprefix("out/cache/").removeprefix("mine/") for name in _content(tmp_path)
     }
-    (pieces / "copy of a.npz").write_bytes((pieces / "a.npz").read_bytes())
+    (cache / "copy of a.npz").write_bytes((cache / "a.npz").read_bytes())
+    scan_copy = cache / "copy-fedcba9876543210.h5"
+    scan_copy.write_bytes(store.path("task/present-fedcba9876543210.h5").read_bytes())
     mine = {**mine, **{k: v for k, v in _content(tmp_path).items() if "copy" in k}}
-    Pieces.clear(out)
+    StudyCache.clear(out)
     assert _content(tmp_path) == mine
-    assert (pieces / "link.npz").is_symlink()
+    assert (cache / "link.npz").is_symlink()
 
 
-def test_a_piece_does_not_replace_a_file_of_the_user(tmp_path, caplog):
+def test_the_folder_of_an_earlier_version_stays_as_it_is(tmp_path):
+    """``OUT/pieces``, where results were cached before: neither read nor removed."""
+    settings = _Settings()
+    assert StudyCache(tmp_path, settings)("x", lambda: 1) == 1
+    (tmp_path / "cache").rename(tmp_path / "pieces")
+    before = _content(tmp_path)
+    assert StudyCache(tmp_path, settings)("x", lambda: 2) == 2
+    StudyCache.clear(tmp_path)
+    assert _content(tmp_path) == before
+
+
+def test_results_of_an_earlier_version_are_not_used_nor_cleared(tmp_path, caplog):
+    """In a folder that the user names again; their mark was ``piece``."""
+    caplog.set_level("INFO")
+    store = Store(tmp_path)
+    for name in ("x", "y"):
+        assert store.cached(name, "key", lambda: 1) == 1
+        with np.load(tmp_path / f"{name}.npz", allow_pickle=False) as file:
+            arrays = {"piece" if k == "cached_as" else k: file[k] for k in file.files}
+        np.savez(tmp_path / f"{name}.npz", **arrays)
+    assert not store.has("x", "key")
+    assert store.cached("x", "key", lambda: 2) == 2
+    assert "x.npz was made by an earlier version: computed again" in caplog.text
+    assert not any(record.levelname == "WARNING" for record in caplog.records)
+    store.clear()
+    assert [path.name for path in tmp_path.iterdir()] == ["y.npz"]
+
+
+def test_a_result_does_not_replace_a_file_of_the_user(tmp_path, caplog):
     np.savez(tmp_path / "x.npz", measured=np.arange(5))
     mine = (tmp_path / "x.npz").read_bytes()
     store = Store(tmp_path)
-    assert [store.piece("x", "key", lambda: 7) for _ in range(2)] == [7, 7]
-    Store(tmp_path / "far").piece("x", "key", lambda: 7)
+    assert [store.cached("x", "key", lambda: 7) for _ in range(2)] == [7, 7]
+    Store(tmp_path / "far").cached("x", "key", lambda: 7)
     execute._keep(
         tmp_path, {name: (tmp_path / "far/x.npz").read_bytes() for name in ("x.npz", "y.npz")}
     )
     assert (tmp_path / "x.npz").read_bytes() == mine
-    assert store.piece("y", "key", lambda: 8) == 7
+    assert store.cached("y", "key", lambda: 8) == 7
     assert "x.npz is not a stored result of a study: it is left unchanged" in caplog.text
 
 
-def test_one_name_is_one_piece(tmp_path):
+def test_one_name_is_one_result(tmp_path):
     for folder in (tmp_path, None):
-        pieces = Pieces(folder, _Settings())
-        pieces("x", lambda: 1)
-        pieces.within("part")("x", lambda: 2)
-        with pytest.raises(ValueError, match="two pieces of a study have the name 'part/x'"):
-            pieces.within("part")("x", lambda: 3)
+        cache = StudyCache(folder, _Settings())
+        cache("x", lambda: 1)
+        cache.within("part")("x", lambda: 2)
+        with pytest.raises(
+            ValueError, match="two cached results of a study have the name 'part/x'"
+        ):
+            cache.within("part")("x", lambda: 3)
 
 
-def test_kills_at_random_moments_lose_one_piece_at_most(tmp_path, monkeypatch):
-    """A study of 12 pieces is killed (SIGKILL) again and again until it gets through; many kills
-    hit a write."""
+def test_kills_at_random_moments_lose_one_result_at_most(tmp_path, monkeypatch):
+    """A study of 12 cached results is killed (SIGKILL) again and again until it gets
+    through; many kills hit a write."""
 
     def slowly(path, savez=np.savez, **arrays):
         savez(whole := io.BytesIO(), **arrays)
@@ -189,7 +223,7 @@ def test_kills_at_random_moments_lose_one_piece_at_most(tmp_path, monkeypatch):
     rng, log, count = np.random.default_rng(0), tmp_path / "log", 12
 
     def study():
-        pieces = Pieces(tmp_path, _Settings())
+        cache = StudyCache(tmp_path, _Settings())
 
         def compute(k):
             time.sleep(0.01)
@@ -197,7 +231,7 @@ def test_kills_at_random_moments_lose_one_piece_at_most(tmp_path, monkeypatch):
                 file.write(f"{k}\n")
             return np.full(1000, k)
 
-        return sum(int(pieces(f"deep/{k}", lambda k=k: compute(k)).sum()) for k in range(count))
+        return sum(int(cache(f"deep/{k}", lambda k=k: compute(k)).sum()) for k in range(count))
 
     kills = 0
     while True:
@@ -221,7 +255,7 @@ def test_kills_at_random_moments_lose_one_piece_at_most(tmp_path, monkeypatch):
     assert study() == 1000 * sum(range(count))
     assert len(log.read_text().split()) <= count + kills
     assert kills > 0
-    Pieces.clear(tmp_path)
+    StudyCache.clear(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["log"]
 
 
@@ -229,8 +263,8 @@ _KILLED = """
 import os, signal, sys
 from pathlib import Path
 from tiny_studies import run_tiny
-from recon.jobs.store import Pieces
-left, keep = int(sys.argv[2]), Pieces.__call__
+from recon.jobs.store import StudyCache
+left, keep = int(sys.argv[2]), StudyCache.__call__
 def call(self, name, compute):
     def dying():
         global left
@@ -240,7 +274,7 @@ def call(self, name, compute):
             os.kill(os.getpid(), signal.SIGKILL)
         return value
     return keep(self, name, dying)
-Pieces.__call__ = call
+StudyCache.__call__ = call
 run_tiny(sys.argv[1], Path(sys.argv[3]))
 """
 
@@ -250,21 +284,21 @@ run_tiny(sys.argv[1], Path(sys.argv[3]))
     "name", ["noise", "motion", "resolution", "hardcases", "detector", "bowtie", "spectral"]
 )
 def test_a_killed_study_goes_on_where_it_was(name, tmp_path, monkeypatch):
-    """Killed at a random piece, again and again: the report is that of a run in one go, and no
-    piece is made twice."""
+    """Killed at a random result, again and again: the report is that of a run in one go, and no
+    result is computed twice."""
     kills = np.random.default_rng(0).integers(1, 4, 4)
     for after in kills:
         run = run_python(_KILLED, name, after, tmp_path / "killed", check=False)
         if run.returncode == 0:
             break
         assert run.returncode == -signal.SIGKILL, run.stderr
-    # What an evaluation keeps of its own is not the study's.
-    kept = (tmp_path / "killed").rglob("pieces/**/*.npz")
+    # The cache of an evaluation is not the study's.
+    kept = (tmp_path / "killed").rglob("cache/**/*.npz")
     finished = len([path for path in kept if "evaluate" not in path.parts])
     assert finished >= 1
-    made, keep = [], Pieces.__call__
+    made, keep = [], StudyCache.__call__
     monkeypatch.setattr(
-        Pieces, "__call__", lambda self, n, f: keep(self, n, lambda: made.append(n) or f())
+        StudyCache, "__call__", lambda self, n, f: keep(self, n, lambda: made.append(n) or f())
     )
     resumed = run_tiny(name, tmp_path / "killed")
     again = len(made)
