@@ -10,7 +10,7 @@ beat is in :mod:`~recon.evaluate.rivals`: the strongest simple filters of a volu
 knows the truth: :func:`evaluate_scans`, and :func:`contrast_recovery`, what a method would show of
 a lesion in a given scan.
 
-Your denoiser on a lung nodule:
+Your denoiser on a lung nodule::
 
     from recon.evaluate import denoiser, evaluate, save
 
