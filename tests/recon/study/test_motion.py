@@ -76,7 +76,7 @@ def test_report(tiny, tmp_path):
     assert {"range [0, A]", "EID-CT less sensitive"} <= {c["paper"] for c in data["checks"]}
     assert len(data["residual"]) == 3
     assert len(data["compensated"]) == 12
-    found = data["found"][0]
+    found = data["estimates"][0]
     assert found["held"] == 1
     assert found["jumps"] == 0
     assert found["error_mm"] < 0.2 * found["true_mm"]
