@@ -94,14 +94,16 @@ def beyond_grid(
         scan, path = scan.select(views), path[views]
         outer, footprint = outer.select(views), footprint.select(views)
     # Columns counted from the footprint's first one, (views, rows, columns).
-    place = torch.arange(-_REACH_COLUMNS, footprint.columns + _REACH_COLUMNS)
-    index = torch.from_numpy(footprint.first_column - outer.first_column)[:, None] + place
+    device = scan.counts.device
+    place = torch.arange(-_REACH_COLUMNS, footprint.columns + _REACH_COLUMNS, device=device)
+    first = torch.from_numpy(footprint.first_column - outer.first_column).to(device)
+    index = first[:, None] + place
     there = (index >= 0) & (index < outer.columns)
     index = index.clamp(0, outer.columns - 1)[:, None].expand(-1, outer.rows, -1)
-    lines = outer.less(scan.line_integrals(), background).cpu().gather(-1, index).double()
-    weights = outer.take(scan.exterior_weights()).cpu().gather(-1, index) * there[:, None]
+    lines = outer.less(scan.line_integrals(), background).gather(-1, index).double()
+    weights = outer.take(scan.exterior_weights()).gather(-1, index) * there[:, None]
     if scan.dead is not None:
-        weights = weights.masked_fill(scan.dead.cpu().gather(-1, index), 0.0)
+        weights = weights.masked_fill(scan.dead.gather(-1, index), 0.0)
     inside = (place >= 0) & (place < footprint.columns)
     off = torch.maximum(-place, place - footprint.columns + 1)  # columns beside the footprint
 
@@ -109,8 +111,10 @@ def beyond_grid(
     free = scan.noise_free
     far = _mean(lines, weights * (off > _FAR_COLUMNS), (0, 2), free)
     lines = lines - torch.where(far.variance < math.inf, far.mean, 0.0)[:, None]
-    low, high = (torch.from_numpy(rows)[:, None] for rows in _rows_of(grid, scan.geometry, path))
-    row = outer.first_row + torch.arange(outer.rows, dtype=torch.float64)
+    low, high = (
+        torch.from_numpy(rows).to(device)[:, None] for rows in _rows_of(grid, scan.geometry, path)
+    )
+    row = outer.first_row + torch.arange(outer.rows, dtype=torch.float64, device=device)
     held = (row > low) & (row < high)
     found = []
     behind = _mean(lines, weights * held[..., None], (0,), free)
