@@ -1,7 +1,7 @@
 """Operations of torchpcct beside those of peers: one process a toolkit, calls interleaved.
 
     pip install -e ".[peers]" && python tests/bench/peers.py [--rounds 7] [--small] [--out FOLDER]
-    [--python /other/venv/bin/python] [--toolkits torchpcct ASTRA]
+    [--python /other/venv/bin/python] [--toolkits torchpcct ASTRA] [--cases parallel fan cone]
 
 Every toolkit computes in a process of its own, so that none disturbs the threads or the memory of
 another; the processes take turns, one call each, so that all meet the same load of the machine. The
@@ -31,6 +31,7 @@ from projectors import Case, _gaussians, _machine, astra_line, ours, xcist
 from recon import fbp
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
 from torchpcct.threads import get_num_threads
+from torchpcct.vector_geometry import VectorGeometry
 
 
 class Toolkit(NamedTuple):
@@ -47,6 +48,10 @@ class Toolkit(NamedTuple):
     projected: Callable[[np.ndarray], np.ndarray] | None = None
     reconstructed: Callable[[], np.ndarray] | None = None
     every: int = 1
+
+
+CASES = ("parallel", "fan", "cone")
+"""Beams of :func:`bench_cases`, in its order."""
 
 
 def bench_cases(small: bool) -> list[Callable[[], Case]]:
@@ -192,11 +197,130 @@ def of_rtk(case: Case) -> Toolkit | None:
     return Toolkit(operations, projected, reconstruct)
 
 
+def of_mbirtorch(case: Case) -> Toolkit | None:
+    """mbirtorch's projectors and direct reconstruction on the CPU, compiled by torch."""
+    g, grid = case.geometry, case.grid
+    if importlib.util.find_spec("mbirtorch") is None or isinstance(g, FanBeam):
+        return None
+    model = mbirtorch_model(g, grid)
+    lines = case.exact["gaussians"].reshape(model.get_params("sinogram_shape")).astype(np.float32)
+
+    def volume(values: np.ndarray) -> np.ndarray:
+        """``values ([z,] y, x)`` as mbirtorch has them, ``(x, y, z)`` or ``(x, y, 1)``."""
+        return np.ascontiguousarray(
+            values.T.reshape(model.get_params("recon_shape")), dtype=np.float32
+        )
+
+    def projected(values: np.ndarray) -> np.ndarray:
+        return np.asarray(model.forward_project(volume(values))).reshape(g.shape)
+
+    def reconstruct() -> np.ndarray:
+        return np.asarray(model.recon_direct(lines)).reshape(grid.shape[::-1]).T
+
+    x = case.images["gaussians"]
+    operations = {
+        "forward": lambda: projected(x),
+        "back": lambda: model.back_project(lines),
+        "FBP": reconstruct,
+    }
+    return Toolkit(operations, projected, reconstruct)
+
+
+def mbirtorch_model(geometry: ParallelBeam | ConeBeam, grid: VolumeGrid) -> Any:
+    """mbirtorch's model of a scan, without the mask that cuts a volume to a cylinder."""
+    import mbirtorch
+
+    shape = {"delta_voxel": grid.spacing[-1], "use_ror_mask": False, "verbose": 0}
+    if isinstance(geometry, ParallelBeam):
+        model = mbirtorch.ParallelBeamModel((geometry.views, 1, geometry.columns), geometry.angles)
+        model.set_params(
+            delta_det_channel=geometry.column_pitch, recon_shape=(*grid.shape[::-1], 1), **shape
+        )
+        return model
+    model = mbirtorch.ConeBeamModel(
+        geometry.shape,
+        geometry.angles,
+        source_detector_dist=geometry.sdd,
+        source_iso_dist=geometry.sod,
+    )
+    model.set_params(
+        delta_det_channel=geometry.column_pitch,
+        delta_det_row=geometry.row_pitch,
+        recon_shape=grid.shape[::-1],
+        **shape,
+    )
+    return model
+
+
+def of_torchtomo(case: Case) -> Toolkit | None:
+    """torchtomo's projectors and FBP on the CPU, by operations of PyTorch.
+
+    Its parallel beam has as many columns as the image, so it takes no part there; of a large cone
+    beam every 90th view is projected, since all would take many minutes.
+    """
+    g, grid = case.geometry, case.grid
+    if importlib.util.find_spec("torchtomo") is None or isinstance(g, ParallelBeam):
+        return None
+    import torchtomo
+
+    def tensor(values: np.ndarray) -> torch.Tensor:
+        """``(1, 1, …)`` float32."""
+        return torch.as_tensor(np.ascontiguousarray(values)[None, None], dtype=torch.float32)
+
+    x, lines = case.images["gaussians"], case.exact["gaussians"]
+    if grid.ndim == 3:
+        every = 90 if grid.voxels > 1e5 else 1
+        vectors = VectorGeometry.of(g).vectors[::every]
+        source, middle, across, down = (vectors[:, None, None, k : k + 3] for k in (0, 3, 6, 9))
+        columns, rows = (np.arange(n) - (n - 1) / 2 for n in (g.columns, g.rows))
+        cells = middle + columns[:, None] * across + rows[:, None, None] * down
+        cone = torchtomo.ConeBeam(
+            grid.shape, tensor(source[:, 0, 0])[0, 0], tensor(cells)[0, 0], grid.spacing
+        )
+        operations = {
+            "forward": lambda: cone.forward(tensor(x)),
+            "back": lambda: cone.adjoint(tensor(lines[::every])),
+        }
+        return Toolkit(
+            operations, lambda image: cone.forward(tensor(image))[0, 0].numpy(), every=every
+        )
+    pixel, half = grid.spacing[-1], grid.extent[-1] / 2
+    # Lengths are in pixels, integrals in halves of the image; its views start a quarter turn later,
+    # and all its axes point the other way.
+    fan = torchtomo.FanBeam(
+        grid.shape[0],
+        g.views,
+        g.columns,
+        src_dist=g.sod / pixel,
+        det_dist=(g.sdd - g.sod) / pixel,
+        det_spacing=g.column_pitch / pixel,
+        angles=torch.as_tensor(g.angles + np.pi / 2, dtype=torch.float32),
+        circle=False,
+    )
+
+    def projected(image: np.ndarray) -> np.ndarray:
+        return fan.forward(tensor(image[::-1, ::-1]))[0, 0].numpy()[:, ::-1] * half
+
+    turned = tensor(lines[:, ::-1] / half)
+
+    def reconstruct() -> np.ndarray:
+        return fan.fbp(turned)[0, 0].numpy()[::-1, ::-1]
+
+    operations = {
+        "forward": lambda: projected(x),
+        "back": lambda: fan.adjoint(turned),
+        "FBP": reconstruct,
+    }
+    return Toolkit(operations, projected, reconstruct)
+
+
 TOOLKITS: dict[str, Callable[[Case], Toolkit | None]] = {
     "torchpcct": of_torchpcct,
     "ASTRA": of_astra,
     "XCIST": of_xcist,
     "RTK": of_rtk,
+    "mbirtorch": of_mbirtorch,
+    "torchtomo": of_torchtomo,
 }
 
 
@@ -286,8 +410,14 @@ def measure(
     # The errors' calls have warmed some operations up: the first call is that of a new process.
     for row in rows:
         fresh = Process(python, row["toolkit"], number, small)
-        row["first_s"] = fresh.ask(row["operation"])[0]
+        answer = fresh.ask(row["operation"])
         fresh.close()
+        if answer is None:
+            raise SystemExit(
+                f"{row['toolkit']} ended at {row['operation']} of {label}, of too little memory "
+                "perhaps: leave it out with --toolkits, or the case with --cases"
+            )
+        row["first_s"] = answer[0]
     for _ in range(rounds):
         for row in rows:
             row["steady"].append(processes[row["toolkit"]].ask(row["operation"]))
@@ -326,6 +456,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     parser.add_argument("--python", default=sys.executable)
     parser.add_argument("--toolkits", nargs="+", choices=list(TOOLKITS), default=list(TOOLKITS))
+    parser.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES))
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     parser.add_argument("--case", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -335,7 +466,7 @@ def main() -> None:
         return
     options.out.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []
-    for number in range(len(cases)):
+    for number in map(CASES.index, options.cases):
         label = cases[number]().name
         names = options.toolkits
         rows += measure(options.python, names, number, label, options.small, options.rounds)
