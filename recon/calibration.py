@@ -62,7 +62,8 @@ FREE: Mapping[str, str] = {
     "tilt": "°",
     "slant": "°",
 }
-"""Numbers that :func:`calibrate` can free, and the unit in which it states them."""
+"""Parameters that :func:`calibrate` can free, and the unit in which it states them (of a scan that
+does not know the size of its cells lengths are in pixels)."""
 _TIMES = 4
 """How often what a volume explains is taken off, beside the first time: of a first approximation a
 cone beam's offset is 0.7 columns off, of the second 0.17, of the third 0.08 (48 rows, ±11°)."""
@@ -92,17 +93,20 @@ class Calibration:
     """Result of :func:`calibrate`.
 
     Attributes:
-        geometry: the scan's, with the numbers that were found; ``torchpcct.formats.geometry_yaml``
-            writes it to a file.
-        values: what was found by name: lengths in mm, angles in degrees, as
-            :func:`torchpcct.projector.with_parameters` has them.
-        errors: their standard errors.
-        shares: of each number's effect on the readings, what no volume explains.
-        correlation: of the numbers' errors, in the order of ``values``.
-        misfit: what is left of the smoothed readings over their noise, root mean square, before and
+        geometry: the scan's, with the parameters that were found;
+            ``torchpcct.formats.geometry_yaml`` writes it to a file.
+        values: what was found by name: lengths in mm, angles in degrees, with the signs of
+            :func:`torchpcct.projector.with_parameters` (which takes angles in rad).
+        errors: their standard errors, in the same units.
+        shares: of each parameter's effect on the readings, the part that no volume explains, 0…1.
+        correlation: of the parameters' errors, ``(parameters, parameters)`` in the order of
+            ``values``.
+        misfit: residual of the smoothed readings over their noise, root mean square, before and
             after; near or below 1 if the geometry is right.
         steps: iterations done.
-        warnings: what restrains trust in the result.
+        warnings: reasons to distrust the result; empty if there are none.
+        lengths: unit of the lengths, "mm", or "pixels" of a scan that does not know the size of its
+            cells.
     """
 
     geometry: Geometry
@@ -113,19 +117,20 @@ class Calibration:
     misfit: tuple[float, float]
     steps: int
     warnings: list[str] = field(default_factory=list)
+    lengths: str = "mm"
 
     def __str__(self) -> str:
         return "\n".join(
-            f"{name:<10} {value:+.4g} ± {self.errors[name]:.2g} {FREE[name]}"
+            f"{name:<10} {value:+.4g} ± {self.errors[name]:.2g} {_unit(name, self.lengths)}"
             for name, value in self.values.items()
         )
 
     def report(self) -> JsonObject:
-        """All numbers, for JSON."""
+        """Values, errors, units and all other figures as a mapping, for JSON."""
         return {
             "values": self.values,
             "errors": self.errors,
-            "units": {name: FREE[name] for name in self.values},
+            "units": {name: _unit(name, self.lengths) for name in self.values},
             "shares": self.shares,
             "correlation": self.correlation,
             "misfit": list(self.misfit),
@@ -142,27 +147,33 @@ def calibrate(
     *,
     progress: Callable[[float], None] | None = None,
 ) -> Calibration:
-    """Numbers of a scan's geometry from the object itself.
+    """Estimate parameters of a scan's geometry from the readings of the object itself.
 
     Needs the whole object in all views, and a grid that holds it; voxels of about a cell as it is
-    seen at the axis, or larger. The errors are those of the readings' noise, larger by what else
-    the volume leaves of them.
+    seen at the axis, or larger. The standard errors follow from the readings' noise; where the
+    residual exceeds that noise, they are larger by the same factor. The method is variable
+    projection (Golub and Pereyra 1973, SIAM J. Numer. Anal. 10:413), see
+    :mod:`recon.calibration`.
 
     Args:
         scan: counting or energy integrating, without energy bins, on the whole detector, which is
             flat; of several slices the middle one is used.
         grid: ``(z, y, x)``, of slices ``(y, x)``.
-        free: names of the numbers to find, of :data:`FREE`; what is not named stays. None:
+        free: names of the parameters to find, of :data:`FREE`; what is not named stays. None:
             ``offset``, with rows also ``roll``. ``offset`` is the detector's column offset,
-            ``axis`` the way of the rotation axis off the line from the source that meets the
-            detector upright: both put the axis elsewhere on the detector, and only a fan tells them
-            apart.
+            ``axis`` the distance of the rotation axis from the line through the source
+            perpendicular to the detector: both put the axis elsewhere on the detector, and only a
+            fan tells them apart.
         progress: called with the finished fraction, 0…1.
 
+    Returns:
+        A :class:`Calibration`: the corrected geometry, values and standard errors (mm, of a scan
+        that does not know the size of its cells pixels, and degrees).
+
     Raises:
-        ValueError: an unknown number, one that the readings do not determine (the message says why,
-            and what to leave out), a scan with energy bins or of a part of the detector, a curved
-            detector, a grid that does not fit.
+        ValueError: an unknown parameter, one that the readings do not determine (the message says
+            why, and what to leave out), an estimate that does not converge, a scan with energy bins
+            or of a part of the detector, a curved detector, a grid that does not fit.
         TypeError: no :class:`torchpcct.Scan`.
 
     Example:
@@ -230,7 +241,13 @@ def calibrate(
         (before, now.misfit),
         step,
         texts,
+        problem.lengths,
     )
+
+
+def _unit(name: str, lengths: str) -> str:
+    """In which a parameter is stated."""
+    return lengths if FREE[name] == "mm" else FREE[name]
 
 
 def _names(scan: Scan, free: Sequence[str] | None) -> list[str]:
@@ -303,6 +320,7 @@ class _CalibrationProblem:
                 "scan.weighted(bin_weights(scanner, …))"
             )
         self.base, self.grid, self.names = geometry, grid, names
+        self.lengths = "pixels" if scan.unit == "pixel^-1" else "mm"
         self.lines, self.weights = lines.float(), weights.float()
         self.cells = axes - 1
         # Of steps and errors: mm of a column, rad of degrees, a part of a distance.
@@ -322,7 +340,7 @@ class _CalibrationProblem:
     def stated(self, values: Floats) -> list[tuple[str, float, str]]:
         """Name, number in the unit in which it is stated, and the unit."""
         return [
-            (n, float(math.degrees(v) if FREE[n] == "°" else v), FREE[n])
+            (n, float(math.degrees(v) if FREE[n] == "°" else v), _unit(n, self.lengths))
             for n, v in zip(self.names, values, strict=True)
         ]
 

@@ -61,6 +61,9 @@ def _calibrate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     made = found.geometry
     vectors = made if isinstance(made, VectorGeometry) else VectorGeometry.of(made)
     about = [f"{_CALIBRATED}{arguments.scan.name}", *str(found).splitlines()]
+    sized = "" if found.lengths == "mm" else " --pitch MM"
+    if sized:
+        about.append("lengths in pixels, the file does not know their size: give --pitch MM, too")
     text = "\n# ".join(about) + "\n"
     text += yaml.safe_dump(geometry_values(vectors), sort_keys=False, default_flow_style=None)
     with atomic_write(arguments.out) as part:
@@ -71,7 +74,7 @@ def _calibrate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     print(found)
     print(
         f"{arguments.out}: torchpcct reconstruct {shlex.quote(str(arguments.scan))} "
-        f"--geometry {shlex.quote(str(arguments.out))}"
+        f"--geometry {shlex.quote(str(arguments.out))}{sized}"
     )
 
 

@@ -224,6 +224,14 @@ def test_a_foreign_scan_without_pixel_size(here, cli):
         ("--pitch -1", "--pitch must be greater than 0 mm"),
     ):
         assert message in cli(f"{command} {option}", 2)
+    # Nor does a calibration invent a size; its geometry takes one.
+    output = cli("calibrate tooth.h5 --free offset --out found.yaml")
+    assert "pixels\nfound.yaml: " in output
+    assert "--geometry found.yaml --pitch MM" in output
+    assert "# lengths in pixels" in (here / "found.yaml").read_text(encoding="utf-8")
+    placed = "reconstruct tooth.h5 --geometry found.yaml --force --out tooth.nii.gz"
+    assert "of 1 × 1 × 1 pixels" in cli(placed)
+    assert "of 0.5 × 0.5 × 0.5 mm" in cli(f"{placed} --pitch 0.5 --mu-water 0.02")
 
 
 def test_names_and_grey_scale_of_their_own(here, cli):

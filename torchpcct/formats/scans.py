@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 from dataclasses import replace
@@ -156,7 +157,10 @@ def open_scan(
             DICOM-CT-PD files.
         geometry: of files that do not hold one (CatSim, MATLAB, a stack without); or, for any file,
             a :class:`~torchpcct.vector_geometry.VectorGeometry` that takes the place of the nominal
-            one. The slices of a parallel stack are then the detector's rows, if it has rows.
+            one, in mm, which also says the size of cells where the file does not. Parallel rays on
+            cells of width 1, as a calibration of such a file has them, stay in pixels: give
+            ``pitch``, too. The slices of a parallel stack are then the detector's rows, if it has
+            rows.
         options: of :func:`adapted`, for every format; of :meth:`torchpcct.Scan.from_counts` for
             Data Exchange, NeXus, Nikon and Zeiss, of it or
             :meth:`torchpcct.Scan.from_line_integrals` for CatSim and MATLAB; ``angles_deg`` and,
@@ -238,7 +242,7 @@ def adapted(
     Args:
         scan: of any format.
         axis: column that the rotation axis projects onto (may be fractional).
-        pitch: cell width in mm, of parallel beams.
+        pitch: cell width in mm, of parallel beams; of vectors only where lengths are in pixels.
         slices: of parallel and fan beams ``(slices, views, columns)``: those to keep; of a cone
             beam its rows.
         mu_water: attenuation of water in mm⁻¹: volumes in HU.
@@ -254,13 +258,17 @@ def adapted(
         scan = _sliced(scan, slices)
         g = scan.geometry
     if pitch is not None:
-        if not (g.on_circle and g.parallel):
+        in_pixels = isinstance(g, VectorGeometry) and g.parallel and scan.unit == "pixel^-1"
+        if not (g.parallel and (g.on_circle or in_pixels)):
             raise ValueError(
                 f"pitch= is the cell width of parallel beams, this is a {kind}, whose geometry has "
                 "it: leave it out"
             )
         wide = number("pitch", pitch, positive=True, unit="mm")
-        g = replace(g, pitch=wide, offset=g.offset * wide / g.pitch)
+        if isinstance(g, VectorGeometry):
+            g = replace(g, vectors=g.vectors * (wide / g.column_pitch))
+        else:
+            g = replace(g, pitch=wide, offset=g.offset * wide / g.pitch)
         scan = replace(scan, geometry=g, unit="mm^-1" if scan.unit == "pixel^-1" else scan.unit)
     if axis is not None:
         if not g.on_circle or scan.window is not None:
@@ -315,11 +323,16 @@ def _placed(scan: Scan, geometry: VectorGeometry) -> Scan:
     """The same readings, of a geometry that was measured view by view."""
     if scan.window is not None:
         raise ValueError("this scan holds a part of the detector: a VectorGeometry needs all of it")
+    unit = scan.unit
+    if unit == "pixel^-1" and not (
+        geometry.parallel and math.isclose(geometry.column_pitch, 1.0, rel_tol=1e-6)
+    ):
+        unit = "mm^-1"
     turned = geometry.has_rows and not scan.geometry.has_rows and scan.counts.ndim == 3
     if turned:
         changed = scan.each(lambda readings: readings.movedim(0, 1).contiguous())
-        return replace(scan, geometry=geometry, **changed)
-    return replace(scan, geometry=geometry)
+        return replace(scan, geometry=geometry, unit=unit, **changed)
+    return replace(scan, geometry=geometry, unit=unit)
 
 
 def _is_own(path: Path) -> bool:

@@ -83,6 +83,28 @@ def test_without_a_pixel_size_lengths_are_in_pixels(tmp_path, size, unit):
         open_scan(path, mu_water=0.04)
 
 
+def test_vectors_say_the_size_that_a_file_does_not_know(tmp_path):
+    """In mm, but for parallel rays on cells of width 1, as a calibration in pixels writes them:
+    there a pitch scales them."""
+    path = tooth(tmp_path / "tooth.h5")
+    with h5py.File(path, "a") as file:
+        del file["measurement"]
+    pixels = open_scan(path).geometry
+    one = VectorGeometry.of(replace(pixels, offset=3.0))
+    half = VectorGeometry.of(replace(pixels, pitch=0.5, offset=1.5))
+    assert open_scan(path, one).unit == "pixel^-1"
+    scaled = open_scan(path, one, pitch=0.5, mu_water=0.04)
+    given = open_scan(path, half, mu_water=0.04)
+    assert (scaled.unit, given.unit, open_scan(path, half).unit) == ("HU", "HU", "mm^-1")
+    grid = VolumeGrid((4, 32, 32), 0.5)
+    volumes = [reconstruct(s, grid, "fbp").data for s in (scaled, given)]
+    torch.testing.assert_close(*volumes, atol=1e-2, rtol=0)
+    with pytest.raises(ValueError, match="whose geometry has it: leave it out"):
+        open_scan(path, half, pitch=0.5)
+    fan = VectorGeometry.of(FanBeam(pixels.angles, 40.0, 80.0, pixels.columns, 1.0))
+    assert open_scan(path, fan).unit == "mm^-1"
+
+
 @pytest.mark.parametrize(
     ("size", "unit", "pitch"),
     [(5e-4, "mm^-1", 0.5), (0.65, "pixel^-1", 1.0), (1.3, "pixel^-1", 1.0)],
