@@ -656,7 +656,8 @@ class Scan:
         return out.to(readings.dtype)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write HDF5; the file appears under its name only when it is complete."""
+        """Write HDF5, which :meth:`load` reads; the file appears under its name only when it is
+        complete, and replaces one of that name."""
         write_scan(self, path)
 
     @classmethod

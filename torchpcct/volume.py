@@ -83,6 +83,10 @@ class Volume:
         unit: of ``data``: "HU", or "mm^-1" where the scan does not know the attenuation of water,
             "pixel^-1" where it does not know the size of its cells (lengths of the grid are in
             pixels then).
+
+    Raises:
+        TypeError: ``data`` that are no floating point tensor.
+        ValueError: ``data`` whose last axes are not the grid's, an unknown unit.
     """
 
     data: Tensor

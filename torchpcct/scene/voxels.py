@@ -77,7 +77,7 @@ class VoxelScene:
     Attributes:
         tissues: all materials.
         numbers: ``(tissues,)`` their CT numbers in that spectrum, at 70 keV if it is the scanner's.
-        scanners_own: whether it is the scanner's.
+        scanners_own: whether that spectrum is the scanner's (``energies_kev`` None).
 
     Raises:
         ValueError: a shape that is not the grid's, CT numbers that are not finite, fewer than two
