@@ -32,7 +32,7 @@ STUDIES: dict[str, str] = {
         "the silicon detector: counts, DQE beside the published one, pile-up, charge sharing"
     ),
     "bowtie": (
-        "ROI bowtie: CTDI and thorax dose, noise inside and outside, and its product with MBIR"
+        "ROI bowtie: CTDI and thorax dose, noise inside and outside, dose saved together with MBIR"
     ),
     "motion": (
         "residual motion in PCCT and EID-CT, and reconstruction with the motion known, "
@@ -56,8 +56,8 @@ STUDIES: dict[str, str] = {
         "what each method shows of small and faint bodies that are inserted into the paper's scan"
     ),
     "spectral": (
-        "energy bins into PE and PVC: monochromatic images, best energy, tissue maps, by "
-        "FBP and joint MBIR"
+        "energy bins as polyethylene and PVC: monochromatic images, best energy, tissue maps, by "
+        "FBP and joint MBIR (no network)"
     ),
 }
 """Name → one line of help. The study ``some-name`` is the module ``recon.study.some_name``."""
