@@ -52,10 +52,6 @@ _LEFT_OUT = (
         "focal spot intensity, heel effect",
         "the focal spot is a uniform rectangle, the spectrum the same over the field",
     ),
-    (
-        "afterglow, readout cross-talk",
-        "counting silicon has no afterglow; tungsten foils part the columns",
-    ),
 )
 """Effects that no scan has, and why."""
 
@@ -230,14 +226,24 @@ class _Probe:
 
 
 def _detector_effects(scanner: Scanner) -> list[Effect]:
-    """Pile-up and charge sharing, as the scanner's detector has them."""
+    """Pile-up, charge sharing and afterglow, as the scanner's detector has them; afterglow
+    last."""
+    afterglow = "afterglow, readout cross-talk"
+    if scanner.detector.energy_integrating:
+        return [
+            Effect("pile-up, charge sharing", False, None, "the detector counts no pulses"),
+            Effect(afterglow, False, None, "every signal is read in its own view and cell"),
+        ]
+    foils = Effect(
+        afterglow, False, None, "counting silicon has no afterglow; tungsten foils part the columns"
+    )
     dead_ns, merge_ns, shared = (
         float(getattr(scanner.detector, name, 0.0))
         for name in ("dead_time_ns", "merge_ns", "charge_sharing")
     )
     far = "behind the body the count rate is far below the detector's limit"
     if not (dead_ns or shared):
-        return [Effect("pile-up, charge sharing", False, None, far)]
+        return [Effect("pile-up, charge sharing", False, None, far), foils]
     lost = (
         f"dead time {dead_ns:g} ns, merging time {merge_ns:g} ns at "
         f"{scanner.source.current_ma:g} mA"
@@ -246,6 +252,7 @@ def _detector_effects(scanner: Scanner) -> list[Effect]:
     return [
         Effect("pile-up", dead_ns > 0, None, lost if dead_ns else far),
         Effect("charge sharing", shared > 0, None, split),
+        foils,
     ]
 
 
@@ -316,7 +323,8 @@ def make_plan(
         omitted = cost(probe.run(everything, _EFFECT_SUB_RAYS, still=True) - reference)
         effects.append(Effect("motion", True, omitted, "exact in every view"))
     scatter, *beam = (Effect(name, False, None, note) for name, note in _LEFT_OUT)
-    effects += [scatter, *_detector_effects(scanner), *beam]
+    *pulses, afterglow = _detector_effects(scanner)
+    effects += [scatter, *pulses, *beam, afterglow]
 
     # Full-sampled reference with only the chosen effects: what the number of sub-rays must
     # reproduce.

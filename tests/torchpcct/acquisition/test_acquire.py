@@ -258,6 +258,18 @@ def test_the_plan_says_what_the_detector_does():
         assert (air != ideal).all()
 
 
+@pytest.mark.parametrize("make", [presets.pcct, presets.eid])
+def test_the_plan_speaks_of_the_scanners_own_detector(make):
+    """An energy-integrating scintillator is no counting silicon."""
+    system = make(views=2, rows=1, columns=100, energy_bin_kev=5.0)
+    scan = acquire(water_cylinder(200.0), system, sub_rays=1)
+    notes = {e["name"]: e["note"] for e in scan.info["plan"]["effects"]}
+    assert set(notes) >= {"scatter", "pile-up, charge sharing", "afterglow, readout cross-talk"}
+    silicon = "counting silicon has no afterglow" in notes["afterglow, readout cross-talk"]
+    assert silicon == ("count rate" in notes["pile-up, charge sharing"])
+    assert silicon == (not system.detector.energy_integrating)
+
+
 def test_a_scene_without_symmetric_bodies():
     """Nothing lies around the only body: rays that miss it read air."""
     ball = Ellipsoid(4.0, position=(30.0, 0.0, 0.0))
