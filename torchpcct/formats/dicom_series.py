@@ -54,6 +54,8 @@ _ROUNDED = 1e-9
 """Relative, of a decimal string of ten digits."""
 _LOWEST = -1024.5
 """Below it no tissue and no air reads, HU."""
+_OFF_PLACE = 0.05
+"""Part of the slices' distance by which one may lie off its place."""
 _AIR = -1000.0
 """CT number of air, HU."""
 
@@ -91,7 +93,7 @@ def dicom_files(folder: str | os.PathLike[str]) -> list[Path]:
         else:
             _LOG.info("%s is no slice: left out", path)
     if not found:
-        raise FileNotFoundError(f"no DICOM files in {folder}")
+        raise FileNotFoundError(f"no DICOM files in {folder}: name the folder that they lie in")
     return found
 
 
@@ -129,7 +131,10 @@ def open_dicom(path: str | os.PathLike[str], **options: object) -> pydicom.Datas
     data = pydicom.dcmread(path, **options)
     frames, samples = int(data.get("NumberOfFrames") or 1), int(data.get("SamplesPerPixel") or 1)
     if frames > 1 or samples > 1:
-        raise ValueError(f"it holds {frames} frames of {samples} colours, expected one grey image")
+        raise ValueError(
+            f"it holds {frames} frames of {samples} colours, expected one grey image: export it as "
+            "one file an image, or convert it to NIfTI (dcm2niix)"
+        )
     if "Rows" in data and "Columns" in data:
         check_expansion((data.Rows, data.Columns), "the image", os.stat(path).st_size, 8)
     return data
@@ -288,6 +293,7 @@ def read_dicom(
                     "the series",
                     sum(p.stat().st_size for p in paths),
                 )
+            _check_placed(d)
             ours = str(d.get("Manufacturer", "")) == _MADE_BY
             pixels, padded = _hounsfield(d, unit, ours)
             replaced += padded
@@ -314,6 +320,28 @@ def read_dicom(
             stacklevel=3,
         )
     return data, grid, unit or "HU"
+
+
+_PLACE = {
+    "SeriesInstanceUID": 0,
+    "ImageOrientationPatient": 6,
+    "ImagePositionPatient": 3,
+    "PixelSpacing": 2,
+}
+"""What says where a slice lies, and of how many numbers."""
+
+
+def _check_placed(d: pydicom.Dataset) -> None:
+    """Raise ``ValueError`` unless an image says where it lies and how large its pixels are."""
+    for name, count in _PLACE.items():
+        value = d.get(name)
+        if value in (None, ""):
+            raise ValueError(
+                f"it has no {name}, so its place is unknown: export it again as CT images, or "
+                "convert it to NIfTI with its place"
+            )
+        if count and (isinstance(value, str) or np.size(value) != count):
+            raise ValueError(f"its {name} has {np.size(value)} numbers, expected {count}")
 
 
 def _may_be_ct(d: pydicom.Dataset) -> bool:
@@ -343,6 +371,14 @@ def _hounsfield(d: pydicom.Dataset, unit: str | None, ours: bool) -> tuple[Float
     intercept = 0.0 if "RescaleIntercept" in missing else float(held["RescaleIntercept"])
     if not (np.isfinite([slope, intercept]).all() and slope != 0):
         raise ValueError(f"its RescaleSlope is {slope:g}, its RescaleIntercept {intercept:g}")
+    kind = str(d.get("PhotometricInterpretation") or "")
+    if not kind.startswith("MONOCHROME"):
+        raise ValueError(f"its pixels are {kind or 'of an unknown kind'}, no grey values")
+    if "BitsStored" in d and int(d.get("HighBit", d.BitsStored - 1)) != d.BitsStored - 1:
+        raise ValueError(
+            f"its HighBit is {d.HighBit} of {d.BitsStored} BitsStored, which DICOM has given up: "
+            f"write its values into the lowest bits, HighBit {d.BitsStored - 1}"
+        )
     stored = d.pixel_array
     pixels = stored.astype(np.float32) * np.float32(slope) + np.float32(intercept)
     padding = None if unit not in (None, "HU") else _padding(d, stored, pixels, ours)
@@ -417,21 +453,28 @@ def _joined(slices: list[_Slice]) -> tuple[Floats32, VolumeGrid]:
         if other.series != series:
             raise ValueError("it holds several series: keep each in a folder of its own")
         if (
-            other.orientation != orientation
-            or other.pixel != pixel
+            not np.allclose(other.orientation, orientation, rtol=0.0, atol=STRAIGHT)
+            or not np.allclose(other.pixel, pixel, rtol=STRAIGHT, atol=0.0)
             or other.image.shape != image.shape
         ):
-            raise ValueError("its slices differ in orientation, spacing or size")
+            raise ValueError(
+                "its slices differ in orientation, spacing or size: keep those that belong "
+                "together in a folder of their own"
+            )
     row, column = np.array(orientation[:3]), np.array(orientation[3:])
     if abs(abs(row[0]) - 1) > STRAIGHT or abs(abs(column[1]) - 1) > STRAIGHT:
         raise ValueError("its slices are not axial: resample it to straight axes first")
     slices.sort(key=lambda s: float(s.position[2]))
     z = np.array([float(s.position[2]) for s in slices])
     gaps = np.diff(z)
-    if gaps.size and (gaps.min() <= 0 or np.ptp(gaps) > 0.01 * float(np.median(gaps))):
+    # Places are rounded, some to two decimals: they may lie off even steps, which rounding does
+    # not make longer.
+    off = np.abs(z - np.linspace(z[0], z[-1], z.size)).max()
+    if gaps.size and not (gaps.min() > 0 and off <= _OFF_PLACE * float(np.median(gaps))):
         at = int(np.argmax(np.abs(gaps - np.median(gaps))))
         raise ValueError(
-            f"slices are missing or repeated between z = {z[at]:g} and {z[at + 1]:g} mm"
+            f"slices are missing or repeated between z = {z[at]:g} and {z[at + 1]:g} mm: copy the "
+            "others, too, and keep each scan in a folder of its own"
         )
     if count and count != len(slices):
         raise ValueError(
@@ -447,5 +490,5 @@ def _joined(slices: list[_Slice]) -> tuple[Floats32, VolumeGrid]:
         data, x = data[..., ::-1], x - (data.shape[2] - 1) * dx
     if column[1] > 0:
         data, y = data[:, ::-1], y - (data.shape[1] - 1) * dy
-    dz = float(np.median(gaps)) if gaps.size else thickness
+    dz = float(gaps.mean()) if gaps.size else thickness
     return np.ascontiguousarray(data), grid_from(data.shape, (dx, dy, dz), (x, y, z[0]))

@@ -19,7 +19,7 @@ import shutil
 import warnings
 import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from torchpcct.files import (
 )
 from torchpcct.formats.damage import check_expansion, check_size, needed, reading
 from torchpcct.formats.dicom_series import DICOM_ENDINGS, check_series
+from torchpcct.formats.lengths import MM
 from torchpcct.formats.volume_grid import STRAIGHT, grid_from
 from torchpcct.geometry import VolumeGrid
 from torchpcct.validate import UNITS
@@ -64,6 +65,8 @@ micrometre."""
 _SAME_PLACE = 0.1
 """Part of a voxel by which sform and qform may differ: they are kept in float32, as a rotation in
 the one, as a matrix in the other."""
+_LONGEST_HEADER = 2**16
+"""Bytes of a MetaImage's header at most."""
 _AFTER_VOXELS = 2**20
 """Bytes that may stand behind the voxels of a packed NIfTI."""
 
@@ -240,6 +243,12 @@ def read_nifti(
         # By what it holds: nibabel looks for another file where an ending is partly in capitals.
         holder = nibabel.fileholders.FileHolder(filename=str(path))
         image: Any = kind_of.from_file_map({"image": holder, "header": holder})
+        header_bytes = kind_of.header_class.sizeof_hdr
+        if image.dataobj.offset < header_bytes:
+            raise ValueError(
+                f"its voxels begin at byte {image.dataobj.offset}, within its header of "
+                f"{header_bytes} bytes: its vox_offset is damaged"
+            )
         shape, kind = tuple(image.shape), image.header.get_data_dtype()
         check_expansion(shape, "the volume", os.stat(path).st_size, max(4, kind.itemsize))
         if len(shape) < 3 or any(n > 1 for n in shape[3:]):
@@ -251,12 +260,12 @@ def read_nifti(
             )
         if kind.kind not in "iuf":
             raise ValueError(f"its voxels are {kind}, no real numbers")
+        _warn_of_places(image.header)  # as the file has it: NiBabel changes it with the axes
         image = image.slicer[(..., *(0,) * (len(shape) - 3))] if len(shape) > 3 else image
         image = nibabel.as_closest_canonical(image)
         code = int(image.header["xyzt_units"]) % 8
         if code not in _MM:
             raise ValueError(f"its unit of length is the unknown code {code}")
-        _warn_of_two_places(image.header)
         affine = image.affine.copy()
         affine[:3] *= _MM[code]
         matrix = affine[:3, :3]
@@ -293,10 +302,19 @@ def _image_kind(begin: bytes) -> Any:
     )
 
 
-def _warn_of_two_places(header: Any) -> None:
-    """Warn where a NIfTI's sform and qform put voxels at different places: readers differ in which
-    one they take."""
-    if not (int(header["sform_code"]) > 0 and int(header["qform_code"]) > 0):
+def _warn_of_places(header: Any) -> None:
+    """Warn where a NIfTI's sform and qform put voxels at different places, or neither says where
+    they are: readers differ in what they take."""
+    known = [int(header[f"{form}_code"]) > 0 for form in ("sform", "qform")]
+    if not any(known):
+        warnings.warn(
+            "its sform and qform are both unset (code 0), so it does not say which side is right: "
+            "its middle is taken for 0 and its x axis points to the left, as by nibabel, for other "
+            "programs to the right; set the sform to the right place",
+            UserWarning,
+            stacklevel=2,
+        )
+    if not all(known):
         return
     sform, qform = header.get_sform(), header.get_qform()
     ends = np.array(list(itertools.product(*((0, n - 1) for n in header.get_data_shape()[:3]))))
@@ -366,49 +384,129 @@ def read_meta_image(
     path: str | os.PathLike[str], unit: str | None = None
 ) -> tuple[Floats32, VolumeGrid, str]:
     """Data ``(z, y, x)`` float32, grid and unit of a MetaImage by SimpleITK; arguments and errors
-    as :func:`read_nifti`."""
+    as :func:`read_nifti`.
+
+    Lengths are in its ``DistanceUnits``, mm if it has none. Its voxels are in the file itself; what
+    lies in another file is refused.
+    """
     sitk = needed("SimpleITK")
     with reading(path, "a MetaImage"):
-        reader = sitk.ImageFileReader()
         with open(path, "rb") as file:
-            if b"=" not in file.read(256):
-                raise ValueError("it does not begin as a MetaImage does, with its fields")
+            fields = _meta_fields(file.read(_LONGEST_HEADER))
+            begin = fields.end
+        reader = sitk.ImageFileReader()
         reader.SetFileName(str(path))
         reader.SetImageIO("MetaImageIO")  # whatever capitals its ending has
         reader.ReadImageInformation()
-        check_size(reader.GetSize(), "the volume")
-        if reader.GetDimension() != 3 or reader.GetNumberOfComponents() != 1:
+        size = tuple(reader.GetSize())
+        check_size(size, "the volume")
+        if len(size) < 3 or any(n > 1 for n in size[3:]) or reader.GetNumberOfComponents() != 1:
             raise ValueError(
-                f"it has {reader.GetDimension()} axes of {reader.GetNumberOfComponents()} "
-                "components"
+                f"it has {size} voxels of {reader.GetNumberOfComponents()} components, expected "
+                "one volume of x, y, z: write each by itself"
             )
-        unit = _unit(
-            reader.GetMetaData("Unit").strip() if reader.HasMetaDataKey("Unit") else "",
-            "field Unit",
-            unit,
-        )
-        check_expansion(reader.GetSize(), "the volume", os.stat(path).st_size)
-        _check_compressed(Path(path).read_bytes())
-        image = sitk.DICOMOrient(reader.Execute(), "RAS")
+        unit = _unit(fields.get("Unit"), "field Unit", unit)
+        length = fields.get("DistanceUnits").lower()
+        if length not in ("", "?", *MM):
+            raise ValueError(f"its lengths are in the unknown unit {length!r}: write them in mm")
+        mm = MM.get(length, 1.0)
+        check_expansion(size, "the volume", os.stat(path).st_size)
+        if not all(0.0 < v < math.inf for v in reader.GetSpacing()):
+            raise ValueError(f"its ElementSpacing is {fields.get('ElementSpacing')}")
+        held = _unpacked_size(path, begin) if fields.packed else os.stat(path).st_size - begin
+        try:
+            image = reader.Execute()
+        except RuntimeError as error:
+            raise ValueError(
+                f"its {held} bytes of voxels are not those of {size} {fields.get('ElementType')}: "
+                "copy or write it again"
+            ) from error
+        image = image[(..., *(0,) * (len(size) - 3))] if len(size) > 3 else image
+        image = sitk.DICOMOrient(image, "RAS")
         direction = np.array(image.GetDirection()).reshape(3, 3)
         if np.abs(direction - np.diag([-1.0, -1.0, 1.0])).max() > STRAIGHT:
             raise ValueError("its axes are oblique: resample it to straight axes first")
-        data = sitk.GetArrayFromImage(image).astype(np.float32)
-        x, y, z = image.GetOrigin()
-        return data, grid_from(data.shape, image.GetSpacing(), (-x, -y, z)), unit
+        values = sitk.GetArrayFromImage(image)
+        if fields.packed and held != values.nbytes:
+            raise ValueError(
+                f"its compressed voxels unpack to {held} bytes, not to the {values.nbytes} of its "
+                "size: copy or write it again"
+            )
+        x, y, z = (mm * v for v in image.GetOrigin())
+        spacing = [mm * v for v in image.GetSpacing()]
+        return values.astype(np.float32), grid_from(values.shape, spacing, (-x, -y, z)), unit
 
 
-def _check_compressed(content: bytes) -> None:
-    """Raise where the compressed voxels of a MetaImage are damaged: ITK fills what it cannot
-    unpack with anything."""
-    mark = b"ElementDataFile = LOCAL\n"
-    header, found, packed = content.partition(mark)
-    if not found or b"CompressedData = True" not in header:
-        return
-    unpack = zlib.decompressobj()
-    while packed and not unpack.eof:
-        unpack.decompress(packed, 2**24)  # bit by bit: a damaged stream may ask for any memory
-        packed = unpack.unconsumed_tail
-    unpack.flush()
+class _MetaFields(NamedTuple):
+    """Fields of a MetaImage's header, and where its voxels begin."""
+
+    values: dict[str, str]
+    end: int
+
+    def get(self, name: str) -> str:
+        """A field; empty: it has none."""
+        return self.values.get(name, "")
+
+    @property
+    def packed(self) -> bool:
+        """Whether the voxels are compressed, as MetaIO reads it."""
+        return self.get("CompressedData")[:1] in ("T", "t", "1")
+
+
+def _meta_fields(begin: bytes) -> _MetaFields:
+    """The header of a MetaImage, which ends with ``ElementDataFile``.
+
+    Raises:
+        ValueError: none; voxels in other files; compressed ones of no given size, which ITK reads
+            as zeros.
+    """
+    values: dict[str, str] = {}
+    at = 0
+    while "ElementDataFile" not in values:
+        line, found, _ = begin[at:].partition(b"\n")
+        name, equals, value = line.decode("latin-1").partition("=")
+        if not (found and equals):
+            raise ValueError("it does not begin as a MetaImage does, with its fields")
+        values[name.strip()] = value.strip()
+        at += len(line) + 1
+    file = values["ElementDataFile"]
+    if file.upper() != "LOCAL":
+        raise ValueError(
+            f"it keeps its voxels in another file, {file!r}: write it as one .mha "
+            "(ElementDataFile = LOCAL)"
+        )
+    fields = _MetaFields(values, at)
+    if fields.packed and not fields.get("CompressedDataSize"):
+        raise ValueError("it does not say its CompressedDataSize: write it again, uncompressed")
+    if fields.get("HeaderSize") not in ("", "0", "-1"):
+        raise ValueError(
+            f"its HeaderSize is {fields.get('HeaderSize')}, but its voxels follow its header: "
+            "leave HeaderSize out"
+        )
+    scale = [fields.get(f"ElementToIntensityFunction{name}") for name in ("Slope", "Offset")]
+    if any(v and float(v) != usual for v, usual in zip(scale, (1.0, 0.0), strict=True)):
+        raise ValueError(
+            f"its values are to be scaled (ElementToIntensityFunctionSlope {scale[0] or 1}, "
+            f"Offset {scale[1] or 0}), which hardly any program does: write the scaled values"
+        )
+    return fields
+
+
+def _unpacked_size(path: str | os.PathLike[str], begin: int) -> int:
+    """Bytes of compressed voxels, unpacked bit by bit: ITK fills what it cannot unpack with
+    anything.
+
+    Raises:
+        ValueError: they end too early. zlib.error: they are damaged.
+    """
+    unpack, total = zlib.decompressobj(), 0
+    with open(path, "rb") as file:
+        file.seek(begin)
+        packed = file.read(2**20)
+        while packed and not unpack.eof:
+            total += len(unpack.decompress(packed, 2**24))  # a damaged stream may ask for any
+            packed = unpack.unconsumed_tail or file.read(2**20)
+    total += len(unpack.flush())
     if not unpack.eof:
         raise ValueError("its compressed voxels end too early")
+    return total
