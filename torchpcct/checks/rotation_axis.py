@@ -54,6 +54,12 @@ _PART = 8
 _UNLIKE = 0.3
 """Squared difference of a half turn's ends over what they show, above which they have nothing in
 common but noise."""
+_LEAST_VIEWS = 4
+"""Views of half a turn: what lies between two that are farther apart is no straight line."""
+_ALIKE_SIGMAS = 3.0
+"""How much more than at the axis, in standard errors, a half turn's ends must differ elsewhere."""
+_NEARBY = 2.0
+"""Columns beside the axis that need not differ so."""
 _NOTHING = (
     "the readings do not tell the axis: where it might be they are no more alike than elsewhere "
     "(nothing but noise, or an object that is round about the axis)"
@@ -138,7 +144,12 @@ def rotation_axis(lines: Tensor, geometry: Geometry) -> RotationAxis:
     half = np.flatnonzero(turn <= math.pi + 1e-4)
     order = half[np.argsort(turn[half], kind="stable")]
     ends = math.pi - float(turn[order[-1]])
-    if order.size < 3 or ends > 2.0 * view_step(g.angles) + 1e-4:
+    if order.size < _LEAST_VIEWS:
+        raise ValueError(
+            f"{order.size} view{'s' * (order.size != 1)} in half a turn are too few, "
+            f"{_LEAST_VIEWS} are needed: the first ones are continued to where the last one stands"
+        )
+    if ends > 2.0 * view_step(g.angles) + 1e-4:
         raise ValueError(
             f"the views cover {math.degrees(turn[order[-1]]):.0f}° of the 180° that the search "
             "needs"
@@ -310,9 +321,19 @@ def _by_ends(lines: Floats, turn: Floats) -> tuple[float, float]:
             else math.inf
         )
 
+    def scatter(column: float) -> tuple[float, float]:
+        """Mean squared difference, and the relative standard error of that of noise."""
+        there = 2 * column - at
+        count = max(int(((there >= 0) & (there <= columns - 1)).sum()), 1)
+        # Both ends compare the same readings, and smoothing ties neighbours.
+        independent = max(count / (2.0 * math.sqrt(math.pi) * width), 1.0)
+        return float((compared(column)[0] ** 2).sum()) / count, 2.0 / independent
+
     reach = int(_REACH * columns)
-    column = min((columns - 1) / 2 + np.arange(-reach, reach + 1), key=unlike)
-    if unlike(column) > _UNLIKE:
+    places = (columns - 1) / 2 + np.arange(-reach, reach + 1)
+    differing = np.array([unlike(c) for c in places])
+    column = float(places[int(np.argmin(differing))])
+    if differing.min() > _UNLIKE:
         return math.nan, math.inf
     for _ in range(12):
         differences, slopes, power, _ = compared(column)
@@ -327,9 +348,14 @@ def _by_ends(lines: Floats, turn: Floats) -> tuple[float, float]:
         float(b.sum())
         for b in np.array_split(slopes * differences - move * power, _BLOCKS, axis=-1)
     ]
-    return float(column), _TIED * math.sqrt(
-        np.square(scores).sum() * _BLOCKS / (_BLOCKS - 1)
-    ) / total
+    error = _TIED * math.sqrt(np.square(scores).sum() * _BLOCKS / (_BLOCKS - 1)) / total
+    least, uncertain = scatter(column)
+    far = np.abs(places - column) > max(_NEARBY, 2.0 * _SIGMAS * error)
+    for place in places[far & np.isfinite(differing)]:
+        there, also = scatter(float(place))
+        if there <= least * (1.0 + _ALIKE_SIGMAS * math.sqrt(uncertain + also)):
+            return math.nan, math.inf  # as alike as at the axis
+    return float(column), error
 
 
 def _by_centroid(lines: Floats, angles: Floats) -> tuple[float, float] | None:
