@@ -12,10 +12,10 @@ compared with the method's. Given are two volumes by each, of two scans with ind
    at: elsewhere nobody can tell what of the object a method keeps, and low noise proves nothing. An
    object that does not change along z shows nothing of a blur along z; such a blur then changes
    neither of the two noises that are compared.
-2. How sharp. The transfer is exp(k - Σ aᵢ (sxⁱ + syⁱ) - Σ bᵢ szⁱ), i = 1, 2, 3, s = sin²(π f) with
-   f in cycles per voxel. (A Gaussian has a₁ alone, as long as it is wide.) It solves Σ J (M - T R)
-   = 0 in which method and reference are of different scans, so that noise drops out: neither low
-   noise nor much of it makes a method sharper.
+2. How sharp. The transfer is exp(k - Σ aᵢ sxⁱ - Σ bᵢ syⁱ - Σ cᵢ szⁱ), i = 1, 2, 3, s = sin²(π f)
+   with f in cycles per voxel. (A Gaussian has the first order alone, as long as it is wide.) It
+   solves Σ J (M - T R) = 0 in which method and reference are of different scans, so that noise
+   drops out: neither low noise nor much of it makes a method sharper.
 3. How noisy. The reference's difference is filtered by that transfer, and its variance over that of
    the method's difference is the factor. A linear filter of the reference gives 1, whatever the
    object and the noise.
@@ -78,6 +78,8 @@ _BORDER = 16
 continue a volume."""
 _ROUGH = "its transfer relative to the reference is no smooth function of the frequency"
 """Why there is no factor, for messages."""
+_WIDEST = math.log(100.0)
+"""Half the interval of ln(factor), above which there is no factor."""
 _MATCH = 0.01
 """Relative standard error of a factor by the match: of 1.00 for linear filters at most."""
 
@@ -92,7 +94,8 @@ class EqualNoise:
         noise_reference: of the reference there, as sharp as the method.
         dose_factor: the ratio of the last two variances, with its 95 % interval; NaN with ``why``.
         f50_plane, f50_z: frequency at which half of the reference's signal is left, line pairs per
-            mm; inf: it does not fall so far as the object shows.
+            mm, in the plane of the mean of y and x; inf: it does not fall so far as the object
+            shows.
         shown_plane, shown_z: up to where the object shows it, line pairs per mm.
         why: there is no factor; empty if there is one.
     """
@@ -250,9 +253,8 @@ class _Match:
         self._white = self.cells.spread(np.where(known, np.sqrt(counts * number / power), 0.0))
         self._hats = hats
         z, y, x = (np.sin(np.pi * np.arange(n) / (2.0 * n)) ** 2 for n in shape)
-        plane = [(y[:, None] ** i + x**i)[None] for i in range(1, orders + 1)]
-        layers = [(z**i)[:, None, None] for i in range(1, orders + 1)]
-        self._terms = [-np.ones((1, 1, 1)), *plane, *(layers if shape[0] > 1 else [])]
+        axes = [y[None, :, None], x[None, None], *([z[:, None, None]] if shape[0] > 1 else [])]
+        self._terms = [-np.ones((1, 1, 1)), *(s**i for s in axes for i in range(1, orders + 1))]
         self._weight = math.prod(np.ix_(*(_taper(n) for n in shape)), start=np.ones(()))
         self._brick = _bricks(shape)
 
@@ -278,7 +280,7 @@ class _Match:
         if not use.any():
             return None
         # Terms of the first order alone: those of higher ones follow when the first are right.
-        few = [0, 1, *([1 + self.orders] if self.shape[0] > 1 else [])]
+        few = [0, *range(1, len(self._terms), self.orders)]
         mean = [self.cells.sums(self._terms[k] * self.shared) / np.maximum(number, 1) for k in few]
         weight = np.sqrt(number[use]) * ratio[use]
         right = -np.log(ratio[use]) * weight
@@ -400,9 +402,17 @@ class _Match:
         drawn = (n - 1) / n * float(np.square(np.array(rest) - np.mean(rest)).sum())
         error = math.sqrt(drawn + (2.0 * moved) ** 2 + _MATCH**2)
         half = float(stats.t.ppf(0.975, n - 1)) * error
+        if not half <= _WIDEST:
+            return without(
+                "these volumes do not tell its resolution: the interval of its factor would be as "
+                f"wide as {math.exp(min(value - half, 700.0)):.2g} to "
+                f"{math.exp(min(value + half, 700.0)):.2g}"
+            )
         factor = Estimate(*(math.exp(min(v, 700.0)) for v in (value, value - half, value + half)))
         one = float(weight.sum()) * 2.0
-        sharp = [self._f50(theta, axis, limit) for axis, limit in zip((2, 0), shown, strict=True)]
+        sharp = [
+            self._f50(theta, axes, limit) for axes, limit in zip(((0, 1), (2,)), shown, strict=True)
+        ]
         return EqualNoise(
             noise,
             math.sqrt(below.sum() / one),
@@ -414,16 +424,23 @@ class _Match:
             shown[1],
         )
 
-    def _f50(self, theta: Floats, axis: int, limit: float) -> float:
-        """Along an axis; the factor k is no matter of sharpness."""
-        first = 1 if axis == 2 else 1 + self.orders
-        if first >= len(theta):
+    def _f50(self, theta: Floats, axes: Sequence[int], limit: float) -> float:
+        """Along an axis, or the mean of several; the factor k is no matter of sharpness.
+
+        Args:
+            theta: parameters.
+            axes: 0, 1: of the plane, y and x; 2: along z.
+            limit: up to where the object shows it, line pairs per mm.
+        """
+        of_axes = theta[1:].reshape(-1, self.orders)
+        if max(axes) >= len(of_axes):
             return math.inf
         f = np.linspace(0.0, 0.5, 2001)
         s = np.sin(np.pi * f) ** 2
-        exponent = sum(theta[first + i] * s ** (i + 1) for i in range(self.orders))
+        exponent = sum(t * s**i for i, t in enumerate(of_axes[list(axes)].mean(0), start=1))
         below = np.flatnonzero(np.asarray(exponent) >= math.log(2.0))
-        found = float(f[below[0]]) / self.spacing[axis] if below.size else math.inf
+        spacing = self.spacing[0] if axes == (2,) else self.spacing[-1]
+        found = float(f[below[0]]) / spacing if below.size else math.inf
         return found if found <= limit else math.inf
 
 
