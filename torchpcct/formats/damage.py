@@ -136,7 +136,28 @@ def read_numbers(path: str | os.PathLike[str], what: str) -> Array:
         if Path(path).suffix.lower() == ".npy":
             # A map of the file fails where its header promises more than there is.
             return np.array(np.load(path, mmap_mode="r", allow_pickle=False))
-        return np.loadtxt(io.StringIO(_text(path)), dtype=np.float64)
+        return _table(_text(path))
+
+
+def _table(text: str) -> Array:
+    """Rows of numbers, ``#`` before a comment.
+
+    Raises:
+        ValueError: no numbers, or a word that is none.
+    """
+    rows = [line.split("#", 1)[0].split() for line in text.splitlines()]
+    if not any(rows):
+        raise ValueError("it holds no numbers")
+    for number, words in enumerate(rows, start=1):
+        for word in words:
+            try:
+                float(word)
+            except ValueError as error:
+                raise ValueError(
+                    f"{word[:30]!r} in line {number} is no number: write numbers with a decimal "
+                    "point, columns apart by blanks, and # before a comment"
+                ) from error
+    return np.loadtxt(io.StringIO(text), dtype=np.float64)
 
 
 def yaml_values(text: str) -> object:

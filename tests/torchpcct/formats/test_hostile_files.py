@@ -217,6 +217,29 @@ def test_tiffs_and_arrays_of_absurd_sizes(tmp_path):
         open_scan(described(tmp_path, readings="b.npy"))
     with little_memory(), pytest.raises(ValueError, match=r"b\.npy cannot be read as a table"):
         read_numbers(tmp_path / "b.npy", "a table")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("0,000\n1,500\n", r"'0,000' in line 1 is no number: .* decimal point"),
+        ("angle\n0.0\n", "'angle' in line 1 is no number: .* # before a comment"),
+        ("# deg\n0.0\n0.5;1.0\n", r"'0\.5;1\.0' in line 3 is no number: .* apart by blanks"),
+        ("", "it holds no numbers"),
+        ("# deg\n\n", "it holds no numbers"),
+    ],
+)
+def test_tables_of_other_spellings_say_what_to_write(tmp_path, text, said):
+    path = tmp_path / "angles.txt"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match=rf"angles\.txt .*{said}"):
+        read_numbers(path, "a table of angles")
+
+
+def test_tables_have_comments_and_a_byte_order_mark(tmp_path):
+    path = tmp_path / "angles.txt"
+    path.write_bytes("\ufeff# deg\n0 1.5  # start\n\n2 3e0\n".encode())
+    assert read_numbers(path, "a table").tolist() == [[0.0, 1.5], [2.0, 3.0]]
     with pytest.raises(ValueError, match=r"the image needs .* GiB of memory are free"):
         check_expansion((2**17, 2**18), "the image", 2**40)
 
