@@ -437,30 +437,8 @@ def second_differences(
 
 
 def quartile_sd(values: NDArray[np.float64]) -> float:
-    """Standard deviation of normal values, from their quartiles: edges among them count little.
-
-    The quartiles are those of ``np.quantile``, which takes three times as long over a few hundred
-    values.
-    """
-    last = values.size - 1
-    if last < 1:
-        return float(np.subtract(*np.quantile(values, (0.75, 0.25)))) * QUARTILES_TO_SD
-    at = (0.75 * last, 0.25 * last)
-    low = [int(k) for k in at]
-    ordered = np.partition(values, [*low, *(k + 1 for k in low), last], axis=None)
-    if math.isnan(ordered[last]):  # NaN lie behind all others
-        return math.nan
-    upper, lower = (
-        _between(float(ordered[k]), float(ordered[k + 1]), place - k)
-        for k, place in zip(low, at, strict=True)
-    )
-    return (upper - lower) * QUARTILES_TO_SD
-
-
-def _between(before: float, behind: float, share: float) -> float:
-    """The value a share of the way from one to the other, from the nearer end, as numpy has it."""
-    step = behind - before
-    return before + step * share if share < 0.5 else behind - step * (1.0 - share)
+    """Standard deviation of normal values, from their quartiles: edges among them count little."""
+    return float(np.subtract(*np.quantile(values, (0.75, 0.25)))) * QUARTILES_TO_SD
 
 
 def dispersion(readings: Tensor, rows: bool) -> float:

@@ -50,6 +50,23 @@ def _digest(key: str, arrays: Mapping[str, Array]) -> str:
     return total.hexdigest()
 
 
+def _read(path: Path) -> tuple[str, dict[str, Array]] | None:
+    """Key and arrays of a stored result; None where an earlier version stored it.
+
+    Raises:
+        ValueError: its checksum is of another content.
+        Exception: whatever a damaged archive leads to.
+    """
+    with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+        arrays = {k: file[k] for k in file.files}
+    if arrays.pop(_MARK, None) is None:
+        return None
+    key, digest = (str(arrays.pop(k, "")) for k in ("key", "sum"))
+    if digest != _digest(key, arrays):
+        raise ValueError("its content does not match its checksum")
+    return key, arrays
+
+
 class Store:
     """A folder of ``.npz`` files, each with the key (settings, parameters) that it was made with,
     and its checksum.
@@ -99,19 +116,14 @@ class Store:
             )
         elif path.exists():
             try:
-                with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-                    arrays = {k: file[k] for k in file.files}
-                if arrays.pop(_MARK, None) is None:
-                    log.info("%s was made by an earlier version: computed again", path)
-                else:
-                    found, digest = (str(arrays.pop(k, "")) for k in ("key", "sum"))
-                    if digest != _digest(found, arrays):
-                        raise ValueError("its content does not match its checksum")
-                    if found == key:
-                        return unpacked(arrays)
-                    log.info("%s was made with other settings: computed again", path)
+                found = _read(path)
+                if found is not None and found[0] == key:
+                    return unpacked(found[1])
             except Exception as error:  # a damaged archive can fail in any way
                 log.warning("%s cannot be read (%s): computed again", path, error)
+            else:
+                why = "by an earlier version" if found is None else "with other settings"
+                log.info("%s was made %s: computed again", path, why)
         arrays = packed(compute())
         if foreign:
             return unpacked(arrays)

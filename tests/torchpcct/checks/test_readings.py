@@ -14,7 +14,6 @@ from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, full_tu
 from torchpcct.checks.defects import repair_defects
 from torchpcct.checks.readings import reading_warnings
 from torchpcct.readings import (
-    QUARTILES_TO_SD,
     interpolate_dead,
     log_bias,
     quartile_sd,
@@ -357,12 +356,9 @@ def test_a_mask_is_no_readings():
         Scan.from_counts(counted() > 100.0, FAN, air=AIR)
 
 
-def test_quartiles_are_those_of_numpy():
-    random = np.random.default_rng(0)
-    for size in [*range(1, 30), 500, 501]:
-        values = random.normal(size=size)
-        values[::4] = values[0]
-        upper, lower = np.quantile(values, (0.75, 0.25))
-        assert quartile_sd(values) == (upper - lower) * QUARTILES_TO_SD
-        values[size // 2] = math.nan
-        assert math.isnan(quartile_sd(values))
+def test_a_tenth_of_edges_counts_little():
+    values = np.random.default_rng(0).normal(scale=3.0, size=4000)
+    assert quartile_sd(values) == pytest.approx(3.0, rel=0.05)
+    values[::10] = 1e4
+    assert quartile_sd(values) == pytest.approx(3.0, rel=0.25)
+    assert np.std(values) > 1e3
