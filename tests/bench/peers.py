@@ -27,6 +27,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
 from projectors import Case, _gaussians, _machine, astra_line, ours, xcist
+from results import write_results
 
 from recon import fbp
 from torchpcct.geometry import ConeBeam, FanBeam, ParallelBeam, VolumeGrid, full_turn
@@ -449,6 +450,24 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def page(rows: list[dict[str, Any]]) -> str:
+    """The table, and when each of its cases was measured: they may be measured one by one."""
+    runs = {r["case"]: r["run"] for r in rows}
+    return "\n".join(
+        [
+            "# Operations beside those of peers",
+            "",
+            "`python tests/bench/peers.py`, calls interleaved. ASTRA takes one core, the others "
+            "all: compare processor seconds, too.",
+            "",
+            *(f"* {case}: {run}" for case, run in sorted(runs.items())),
+            "",
+            table(rows),
+            "",
+        ]
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=7)
@@ -464,16 +483,19 @@ def main() -> None:
     if options.worker:
         serve(options.worker, cases[options.case]())
         return
-    options.out.mkdir(parents=True, exist_ok=True)
-    rows: list[dict[str, Any]] = []
+    kept = options.out / "peers.json"
+    rows: list[dict[str, Any]] = json.loads(kept.read_text()) if kept.exists() else []
     for number in map(CASES.index, options.cases):
         label = cases[number]().name
         names = options.toolkits
-        rows += measure(options.python, names, number, label, options.small, options.rounds)
+        found = measure(options.python, names, number, label, options.small, options.rounds)
         now = datetime.datetime.now(datetime.UTC)
-        report = f"{_machine()}, {now:%Y-%m-%d %H:%M} UTC, load {os.getloadavg()[0]:.1f}\n\n"
-        (options.out / "peers.md").write_text(report + table(rows) + "\n")
-        (options.out / "peers.json").write_text(json.dumps(rows, indent=1))
+        run = (
+            f"{options.rounds} rounds, {_machine()}, {now:%Y-%m-%d %H:%M} UTC, load "
+            f"{os.getloadavg()[0]:.1f}"
+        )
+        rows = [r for r in rows if r["case"] != label] + [r | {"run": run} for r in found]
+        write_results(options.out, "peers", rows, page(rows))
         print(table(rows), flush=True)
 
 

@@ -20,6 +20,7 @@ from typing import Any
 from unittest import mock
 
 import torch
+from results import write_results
 from rival_scenes import DIRECTIONS, Bench, Place
 from torch import Tensor
 
@@ -197,11 +198,12 @@ def main() -> None:
             "volume, HU rms, beside "
             f"the {MOVED_HU:g} HU that were added to the inset.\n\n{table(results)}\n"
         )
-        (HERE / "prior_parts.md").write_text(
-            f"# What each part of the prior brings\n\n{text}", encoding="utf-8"
+        write_results(
+            HERE,
+            "prior_parts",
+            {"draws": DRAWS, "results": results},
+            f"# What each part of the prior brings\n\n{text}",
         )
-        plain = {"draws": DRAWS, "results": results}
-        (HERE / "prior_parts.json").write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
         print(f"{time.perf_counter() - began:.0f} s: {use}", flush=True)
 
 

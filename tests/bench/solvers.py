@@ -11,7 +11,6 @@ momentum (Kim, Ramani, Fessler 2015). One pair is one A and one Aᵀ of all view
 """
 
 import argparse
-import json
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from results import write_results
 from torch import Tensor
 
 from recon.gram.gram import Gram
@@ -159,9 +159,7 @@ def main() -> None:
         ]
     )
     print(text)
-    args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / "solvers.md").write_text(text)
-    (args.out / "solvers.json").write_text(json.dumps(curves))
+    write_results(args.out, "solvers", curves, text)
     _draw(curves, args.out / "solvers.png")
 
 
