@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 WIDER = 2
 """Voxels of the coarser scan in voxels of the grid, in the plane."""
-CUT = 0.16
+CUT = 0.2
 """In-plane frequency, 1/voxel, at which half of a wave's energy is taken from the coarser scan: all
-of it at frequencies a quarter lower, none a quarter higher. The wider voxels represent up to
-0.25."""
+of it at frequencies a quarter lower, none a quarter higher, at 0.25, the highest that the wider
+voxels represent."""
 EVERY = 4
 """Views of the scan for one of the coarser scan, at most."""
 DIRECTIONS = 0.75

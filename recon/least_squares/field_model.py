@@ -69,7 +69,10 @@ LEAST_MET = 0.5
 by themselves, slices beyond the rows of a cone beam hang on the prior alone and spoil the condition
 number."""
 SECTORS = 6
-"""Sectors of ray directions with a D of their own. Of 4 to 12, four took one pair in five more."""
+"""Sectors of ray directions with a D of their own, in a plane. Of 4 to 12, four took one pair in
+five more."""
+SECTORS_BESIDE_COARSE_SCAN = 3
+"""Those of a volume, where a coarser scan has the slow waves: six take as many pairs."""
 FAINTEST = 0.02
 """Smallest D_b², as a share of D²: rays of a sector may all be opaque."""
 INNER = (3, 10)
@@ -194,10 +197,11 @@ class FieldModel:
                 (np.fft.fftfreq, np.fft.rfftfreq), size, self.grid.spacing[-2:], strict=True
             )
         )
-        waves = _sectors(np.arctan2(fy[:, None], fx) + math.pi / 2)
-        waves[:, 0, 0] = 1.0 / SECTORS  # what is constant has no direction
+        sectors = SECTORS if self.coarse is None else SECTORS_BESIDE_COARSE_SCAN
+        waves = _sectors(np.arctan2(fy[:, None], fx) + math.pi / 2, sectors)
+        waves[:, 0, 0] = 1.0 / sectors  # what is constant has no direction
         found = []
-        for wave, ray in zip(waves, _sectors(self._ways), strict=True):
+        for wave, ray in zip(waves, _sectors(self._ways, sectors), strict=True):
             share = torch.from_numpy(ray[:, None] if self.grid.ndim == 3 else ray).to(self.seen)
             whole = (share * lines).sum().clamp_min(1e-6 * lines.sum())
             spread = torch.maximum(
@@ -272,7 +276,7 @@ class GradientStep:
         self.prior = prior
         self._grid = tuple(x.shape[-len(prior.spacing) :])
         self._prior = prior.spectrum(self._grid).to(x)
-        self._steps, self._share = 0, 1.0
+        self._steps, self._curvature = 0, 1.0
         self._scale: Tensor | None = None
         inverse = torch.ones((), dtype=x.dtype, device=x.device)
         if scale is not None:
@@ -283,13 +287,13 @@ class GradientStep:
 
     def step(self, x: Tensor, data_gradient: Tensor) -> tuple[Tensor, int]:
         """The direction of descent, ``(batch, *shape)``, and 0: no iteration of a model."""
-        self._look_at(x)
+        self._measure_curvature(x)
         return -self._precondition(data_gradient + self.prior.gradient(x)), 0
 
-    def _look_at(self, x: Tensor) -> None:
+    def _measure_curvature(self, x: Tensor) -> None:
         """How curved the prior is at x; after 0, 1, 2, 4, 8 … steps: by then x hardly changes."""
         if self._steps & (self._steps - 1) == 0:
-            self._share = mean_share(self.prior, x)
+            self._curvature = mean_share(self.prior, x)
         self._steps += 1
 
     def _precondition(self, g: Tensor) -> Tensor:
@@ -298,7 +302,7 @@ class GradientStep:
         out = torch.zeros_like(g)
         for data, share, weight in self._nodes:
             part = torch.fft.rfftn(g * share, dim=axes).div_(
-                data + self._share * weight * self._prior
+                data + self._curvature * weight * self._prior
             )
             out += share * torch.fft.irfftn(part, s=self._grid, dim=axes)
         return out if self._scale is None else out * self._scale
@@ -326,7 +330,7 @@ class FieldStep(GradientStep):
 
     def step(self, x: Tensor, data_gradient: Tensor) -> tuple[Tensor, int]:
         """The direction of descent, ``(batch, *shape)``, and how many iterations were allowed."""
-        self._look_at(x)
+        self._measure_curvature(x)
         gradient = data_gradient + self.prior.gradient(x)
         step = conjugate_gradient(
             lambda v: self._model.apply(v) + self.prior.majorizer(x, v),
@@ -352,12 +356,12 @@ def ray_azimuths(projector: Projector) -> NDArray[np.float64] | None:
     return ways if window is None else np.take_along_axis(ways, window.column_indices, axis=1)
 
 
-def _sectors(ways: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Share of directions, rad, in each sector of the half circle: ``(SECTORS, *shape)``, in
+def _sectors(ways: NDArray[np.float64], number: int) -> NDArray[np.float64]:
+    """Share of directions, rad, in each sector of the half circle: ``(number, *shape)``, in
     straight lines from one to the next."""
-    at = ways % math.pi / math.pi * SECTORS
-    middles = np.arange(SECTORS).reshape(-1, *[1] * ways.ndim)
-    away = np.abs((at - middles + SECTORS / 2) % SECTORS - SECTORS / 2)
+    at = ways % math.pi / math.pi * number
+    middles = np.arange(number).reshape(-1, *[1] * ways.ndim)
+    away = np.abs((at - middles + number / 2) % number - number / 2)
     shares: NDArray[np.float64] = np.maximum(1.0 - away, 0.0)
     return shares
 

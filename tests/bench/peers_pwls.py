@@ -43,7 +43,7 @@ PHOTONS = 1e5
 """Of an unattenuated reading."""
 BLUR = 0.2
 """Line pairs a voxel at which the prior's curvature equals that of the data."""
-ITERATIONS = (1, 2, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
+ITERATIONS = (1, 2, 4, 8, 16, 24, 32, 48, 64)
 TARGETS_HU = (30.0, 3.0, 1.0)
 """Distances to the minimum, rms, whose times are in the table; the curve ends at the last."""
 MANY = 200

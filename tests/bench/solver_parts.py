@@ -22,6 +22,7 @@ from unittest import mock
 
 import numpy as np
 import torch
+from results import write_results
 from torch import Tensor
 
 from recon.analytic.fbp import fbp
@@ -172,15 +173,17 @@ def changed(module: Any, **values: Any) -> Callable[[], Any]:
 def one_sector() -> Any:
     """One sector of all directions."""
     return mock.patch.multiple(
-        field_model, SECTORS=1, _sectors=lambda ways: np.ones((1, *ways.shape))
+        field_model,
+        SECTORS_BESIDE_COARSE_SCAN=1,
+        _sectors=lambda ways, _: np.ones((1, *ways.shape)),
     )
 
 
 PARTS: dict[str, Callable[[], Any]] = {
     "as it is": contextlib.nullcontext,
     "no coarser scan": changed(field_model, coarse_scan=lambda *_: None),
-    "its cut-off at half the frequency": changed(coarse_scan, CUT=0.08),
-    "its cut-off at the highest frequency that its voxels hold": changed(coarse_scan, CUT=0.2),
+    "its cut-off at half the frequency": changed(coarse_scan, CUT=0.1),
+    "its cut-off at four fifths of it": changed(coarse_scan, CUT=0.16),
     "its voxels as wide as those of the grid": changed(coarse_scan, WIDER=1),
     "half of its views": changed(coarse_scan, EVERY=8, DIRECTIONS=0.375),
     "twice its views": changed(coarse_scan, EVERY=2, DIRECTIONS=1.5),
@@ -189,8 +192,8 @@ PARTS: dict[str, Callable[[], Any]] = {
     "until the residual is 10 % of the first, not 3 %": changed(field_model, INNER_REDUCTION=0.1),
     "16, or until it is 10 %": changed(field_model, INNER_OF_VOLUMES=16, INNER_REDUCTION=0.1),
     "one sector of directions": one_sector,
-    "three sectors": changed(field_model, SECTORS=3),
-    "twelve sectors": changed(field_model, SECTORS=12),
+    "six sectors": changed(field_model, SECTORS_BESIDE_COARSE_SCAN=6),
+    "twelve sectors": changed(field_model, SECTORS_BESIDE_COARSE_SCAN=12),
     "one spectrum for all slices": changed(field_model, FACTOR=math.inf),
 }
 """What is done to the solver."""
@@ -209,7 +212,7 @@ def counted(cases: Sequence[Case], part: Callable[[], Any]) -> list[str]:
 
 
 def main() -> None:
-    """Run, print the table, write ``solver_parts.md``."""
+    """Run, print the table, write ``solver_parts.json`` and ``solver_parts.md``."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--voxels", type=int, default=32)
     parser.add_argument("--objects", nargs="+", choices=list(OBJECTS), default=list(OBJECTS))
@@ -230,15 +233,16 @@ def main() -> None:
         "|" + "---|" * len(head_row),
     ]
     print("\n".join(lines), flush=True)
-    for name, part in PARTS.items():
-        lines.append(f"| {' | '.join([name, *counted(cases, part)])} |")
+    rows = []
+    for name, part in [*PARTS.items(), ("from 0", contextlib.nullcontext)]:
+        if name == "from 0":
+            for case in cases:
+                case.start = None
+        row = [name, *counted(cases, part)]
+        rows.append(dict(zip(["part", *head_row[1:]], row, strict=True)))
+        lines.append(f"| {' | '.join(row)} |")
         print(lines[-1], flush=True)
-    for case in cases:
-        case.start = None
-    lines.append(f"| {' | '.join(['from 0', *counted(cases, contextlib.nullcontext)])} |")
-    print(lines[-1], flush=True)
-    args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / "solver_parts.md").write_text("\n".join([*lines, ""]))
+    write_results(args.out, "solver_parts", rows, "\n".join([*lines, ""]))
 
 
 if __name__ == "__main__":

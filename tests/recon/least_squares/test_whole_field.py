@@ -11,7 +11,11 @@ from inset_operators import HU, dense, minimum, problem
 
 from recon.gram.gram import Gram
 from recon.least_squares import field_model
-from recon.least_squares.field_model import SECTORS, FieldModel
+from recon.least_squares.field_model import (
+    SECTORS,
+    SECTORS_BESIDE_COARSE_SCAN,
+    FieldModel,
+)
 from recon.least_squares.field_problem import field_prior
 from recon.least_squares.pwls import Approach, data_model, pwls
 from recon.least_squares.qggmrf import QGGMRF, quadratic
@@ -362,6 +366,7 @@ def test_the_coarser_scan_knows_waves_that_change_slowly_in_the_plane(shape):
     w = torch.exp(-0.4 * A(((x - 4) ** 2 + (2 * y) ** 2 < 40).float()))
     model = FieldModel(A, w)
     assert model.coarse is not None
+    assert len(model.terms) == SECTORS_BESIDE_COARSE_SCAN
     noise = torch.randn(A.domain_shape, generator=torch.Generator().manual_seed(0))
     fy, fx = torch.fft.fftfreq(shape[1])[:, None], torch.fft.rfftfreq(shape[2])
     slow = torch.fft.irfft2(torch.fft.rfft2(noise) * (torch.hypot(fy, fx) < 0.11), s=shape[1:])

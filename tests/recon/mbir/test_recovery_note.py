@@ -25,11 +25,17 @@ def measured(monkeypatch):
 
 
 def test_the_smallest_balls_that_lose_contrast_are_named():
-    (text,) = recovery_note.contrast_note("abc", 35.0, 0.5)
+    (text,) = recovery_note.contrast_note("abc", 45.0, 0.5)
     first = text.index("25 % of a ball of 1 mm and +100 HU (soft FBP 69 %)")
     assert first < text.index("10 % of a ball of 2 mm")
     assert "0.5 mm" not in text  # hardly less than by soft FBP
     assert "3 mm" not in text
+
+
+def test_between_two_noise_scales_the_figures_lie_between(measured):
+    (text,) = recovery_note.contrast_note("abc", (16.0 * 40.0) ** 0.5, 0.5)
+    assert "45 % of a ball of 1 mm" in text  # the mean of 25 and 65
+    assert text.count("a ball") == 1  # the others were measured at more noise only
 
 
 def test_of_a_size_the_ball_that_loses_most_is_named(monkeypatch):
