@@ -149,7 +149,7 @@ def write_results(folder):
             folder / f"{name}.md",
             _linked("\n".join([f"# {name}: {title[2:]}", *pictures, text]), ""),
         )
-    measured = ("projectors", "peers", "solvers")
+    measured = ("projectors", "peers", "solvers", "peers_pwls")
     records = (ROOT / "tests" / "bench" / f"{name}.md" for name in measured)
     speed = re.sub(
         r"^#", "##", "\n".join(r.read_text(encoding="utf-8") for r in records), flags=re.MULTILINE
@@ -204,7 +204,9 @@ def write_notebooks(folder):
 def _linked(text, to):
     text = re.sub(r"\]\((\w+)/report\.md\)", rf"]({to}\1.md)", text)
     text = re.sub(
-        r"\]\([^)]*tests/bench/(?:projectors|peers|solvers)\.md\)", rf"]({to}speed.md)", text
+        r"\]\([^)]*tests/bench/(?:projectors|peers|solvers|peers_pwls)\.md\)",
+        rf"]({to}speed.md)",
+        text,
     )
     text = text.replace("](docs/", "](")
     return re.sub(
