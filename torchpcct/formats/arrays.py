@@ -156,9 +156,20 @@ def _picked(found: dict[str, tuple[int, ...]], variable: str | None) -> str:
     if variable is not None:
         return choice("variable", variable, tuple(found))
     arrays = [name for name, shape in found.items() if sum(n > 1 for n in shape) > 1]
+    if not found:
+        raise ValueError(
+            "it holds no array of numbers of its own: structures, cells, sparse and logical arrays "
+            "are not read; save the array itself, as double, single or an integer type"
+        )
     if len(arrays) != 1:
-        listed = ", ".join(f"{name} {shape}" for name, shape in found.items()) or "none of numbers"
-        raise ValueError(f"it holds {len(arrays)} arrays: give variable=, one of {listed:.300}")
+        listed = ", ".join(f"{name} {shape}" for name, shape in found.items())
+        how = (
+            f"arrays: give variable=, one of {listed:.300}"
+            if arrays
+            else f"arrays of more than one row and column, only {listed:.300}: save the readings "
+            "with an axis of views and one of columns, or give variable= if they are of one view"
+        )
+        raise ValueError(f"it holds {len(arrays)} {how}")
     return arrays[0]
 
 

@@ -109,21 +109,32 @@ def _decoded(content: bytes) -> str:
     )
 
 
-def read_text(path: str | os.PathLike[str], what: str) -> str:
+def read_text(path: str | os.PathLike[str], what: str, other: str | None = None) -> str:
     """A text file of at most 256 MiB, read as ``what``, with or without a byte-order mark.
+
+    Args:
+        path: file.
+        what: it is, in messages.
+        other: encoding of files that are not UTF-8, where what matters is ASCII; characters that it
+            does not know are replaced. None: refused.
 
     Raises:
         FileNotFoundError: no such file. ValueError: no text, or a longer one.
     """
     with reading(path, what):
-        return _text(path)
+        return _text(path, other)
 
 
-def _text(path: str | os.PathLike[str]) -> str:
+def _text(path: str | os.PathLike[str], other: str | None = None) -> str:
     content = _beginning(path, _LONGEST_TABLE + 1)
     if len(content) > _LONGEST_TABLE:
         raise ValueError(f"it has more than {_LONGEST_TABLE} bytes")
-    return _decoded(content)
+    try:
+        return _decoded(content)
+    except UnicodeDecodeError:
+        if other is None or any(content.startswith(mark) for mark, _ in _MARKS):
+            raise
+        return content.decode(other, errors="replace")
 
 
 def read_numbers(path: str | os.PathLike[str], what: str) -> Array:

@@ -36,6 +36,12 @@ _FLAT = 1
 """Of an image of the open beam."""
 _DARK = 2
 """Of an image without beam."""
+_INVALID = 3
+"""Of an image that is not to be used."""
+_ALIGNMENT = -1
+"""In ``image_key_control``, which the ESRF's files have beside the key (package nxtomo): of an
+image taken after the scan to see whether the object has moved. NXtomo's key calls it a
+projection."""
 _DEEPEST = 5
 """Groups between the file and its detector."""
 _SAME_TIME = 1e-3
@@ -51,10 +57,21 @@ def _detectors(group: h5py.Group, depth: int = 0) -> Iterator[h5py.Group]:
             continue
         found = group[name]
         if isinstance(found, h5py.Group):
-            if "image_key" in found.keys() and "data" in found.keys():  # noqa: SIM118 (in would follow links)
+            if all(_is_array(found, each) for each in ("image_key", "data")):
                 yield found
             elif depth < _DEEPEST:
                 yield from _detectors(found, depth + 1)
+
+
+def _is_array(group: h5py.Group, name: str) -> bool:
+    """Whether a group has something by a name that is a data set, or a link, which is not
+    followed."""
+    import h5py
+
+    link = group.get(name, getlink=True)
+    return link is not None and not (
+        isinstance(link, h5py.HardLink) and isinstance(group[name], h5py.Group)
+    )
 
 
 def holds_nexus(file: h5py.File) -> bool:
@@ -114,16 +131,13 @@ def read_nexus(
     Raises:
         FileNotFoundError: no such file.
         ValueError: no NXtomo, damaged, several scans and no ``entry``, one that keeps data in other
-            files; no flats, angles in an unknown unit.
+            files; a key that NXtomo does not know, no flats, angles in an unknown unit.
     """
     import h5py
 
     with reading(path, "a NeXus tomography"), h5py.File(path, "r") as file:
         detector = _detector(file, entry)
-        data, key = (
-            inside(file, f"{detector}/data"),
-            np.ravel(inside(file, f"{detector}/image_key")[()]).astype(int),
-        )
+        data, key = inside(file, f"{detector}/data"), _keys(file, detector)
         check_size(data.shape, data.name)
         if data.ndim != 3 or key.size != data.shape[0]:
             raise ValueError(
@@ -190,6 +204,25 @@ def _detector(file: h5py.File, entry: str | None) -> str:
     if len(found) > 1:
         raise ValueError(f"it holds {len(found)} scans: give entry=, one of {', '.join(found)}")
     return str(next(iter(found.values())))
+
+
+def _keys(file: h5py.File, detector: str) -> Ints:
+    """What each frame is; images of alignment are not to be used."""
+    name = f"{detector}/image_key"
+    given = np.ravel(np.asarray(inside(file, name)[()]))
+    known = (_PROJECTION, _FLAT, _DARK, _INVALID)
+    wrong = given[~np.isin(given, known)]
+    if wrong.size:
+        raise ValueError(
+            f"{name} holds {wrong[0].item()!r}, of frame "
+            f"{int(np.flatnonzero(~np.isin(given, known))[0])}: NXtomo knows 0 (projection), 1 "
+            "(flat), 2 (dark) and 3 (invalid); mark frames that are not to be used by 3"
+        )
+    key = given.astype(np.int64)
+    control = inside(file, f"{name}_control")
+    if control is not None and control.size == key.size:
+        key[np.ravel(control[()]) == _ALIGNMENT] = _INVALID
+    return key
 
 
 def _taken(data: h5py.Dataset, which: Bools, rows: slice) -> Any:

@@ -76,7 +76,7 @@ def read_xtekct(
         ValueError: a value that is missing or none, another number of images than ``Projections``,
             damaged images.
     """
-    text = read_text(path, "a Nikon scan")
+    text = read_text(path, "a Nikon scan", other="cp1252")  # names of operators and parts
     with reading(path, "a Nikon scan"):
         file = configparser.ConfigParser(interpolation=None, strict=False)
         file.read_string(text)
@@ -89,9 +89,17 @@ def read_xtekct(
         values = {
             name: number(name, about[name], positive=name != "AngularStep") for name in _NEEDED
         }
+        for name in ("Projections", "DetectorPixelsX", "DetectorPixelsY"):
+            if not values[name].is_integer():
+                raise ValueError(f"{name} must be a whole number, got {about[name]!r}")
         views, columns, rows = (
             int(values[k]) for k in ("Projections", "DetectorPixelsX", "DetectorPixelsY")
         )
+        if not values["AngularStep"] and views > 1:
+            raise ValueError(
+                f"AngularStep is 0 and there are {views} Projections: the object has not turned; "
+                "write the step in degrees"
+            )
         magnification = values["SrcToDetector"] / values["SrcToObject"]
         top, bottom = (_optional(about, f"CentreOfRotation{end}") for end in ("Top", "Bottom"))
         moved = about.get("ObjectOffsetX", "").strip()
@@ -169,4 +177,13 @@ def _images(path: Path, about: Mapping[str, str], views: int) -> list[Path]:
             break
     if len(found) != views:
         raise ValueError(f"it says {views} Projections, {len(found)} images {name}_….tif are there")
+    counts = [int(number.group()) for each in found if (number := re.search(r"\d+$", each.stem))]
+    steps = np.diff(counts)  # every second view of a scan is sound, too
+    if steps.size and (steps[0] < 1 or np.any(steps != steps[0])):
+        at = int(np.argmax(steps != np.median(steps)))
+        raise ValueError(
+            f"the numbers of its images do not go on evenly: {found[at + 1].name} follows "
+            f"{found[at].name}; a view is missing or there twice, and all that follow would have "
+            "wrong angles: restore its images as they were taken"
+        )
     return found

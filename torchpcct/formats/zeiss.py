@@ -174,6 +174,12 @@ def _geometry(held: _Streams, count: int, height: int, width: int) -> Geometry:
         )
         if stream is not None:
             shifts[axis] = held.numbers(stream, "<f4", count).astype(np.float64)
+            wrong = np.flatnonzero(~np.isfinite(shifts[axis]))
+            if wrong.size:
+                raise ValueError(
+                    f"its {stream} of image {wrong[0] + 1} is {shifts[axis][wrong[0]]}, no shift: "
+                    "export the scan again"
+                )
     if any(float(np.abs(s).max()) > _STILL for s in shifts.values()):
         return VectorGeometry.of(circle).shifted(**shifts)
     return circle

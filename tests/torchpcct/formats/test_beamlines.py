@@ -195,6 +195,42 @@ def test_nexus_that_is_no_scan_or_several(tmp_path):
         open_scan(tmp_path / "b.h5")
 
 
+@pytest.mark.parametrize("wrong", [7, 0.7, np.nan, -1, b"projection"])
+def test_image_keys_that_nexus_does_not_know_are_refused(tmp_path, wrong):
+    path = nexus(tmp_path / "a.nxs", DATA, WHITE, GEOMETRY.angles, DARK, 500.0)
+    name = "entry/instrument/detector/image_key"
+    with h5py.File(path) as file:
+        key = file[name][()]
+    key = key.astype("S10" if isinstance(wrong, bytes) else float)
+    key[20] = wrong
+    rewritten(path, name, key)
+    first = 0 if isinstance(wrong, bytes) else 20
+    with pytest.raises(ValueError, match=rf"image_key holds .*, of frame {first}: NXtomo knows 0"):
+        open_scan(path)
+
+
+def test_images_of_alignment_of_a_nexus_file_are_no_views(tmp_path):
+    # taken after the scan, as if the object had moved by then
+    data = np.concatenate([DATA, np.roll(DATA[:3], 9, -1)])
+    angles = np.concatenate([GEOMETRY.angles, [np.pi, np.pi / 2, 0.0]])
+    path = nexus(tmp_path / "a.nxs", data, WHITE, angles, DARK, 500.0)
+    with h5py.File(path, "a") as file:
+        detector = file["entry/instrument/detector"]
+        control = detector["image_key"][()].astype(int)
+        control[np.flatnonzero(control == 0)[-3:]] = -1
+        detector["image_key_control"] = control
+    close(open_scan(path))
+
+
+def test_a_group_in_the_place_of_nexus_frames(tmp_path):
+    path = nexus(tmp_path / "a.nxs", DATA, WHITE, GEOMETRY.angles, DARK, 500.0)
+    with h5py.File(path, "a") as file:
+        del file["entry/instrument/detector/data"], file["entry/data"]
+        file.create_group("entry/instrument/detector/data")
+    with pytest.raises(ValueError, match="it has no detector with data and image_key"):
+        open_scan(path)
+
+
 @pytest.mark.parametrize("form", ["exchange", "nexus"])
 @pytest.mark.parametrize(
     "kind", ["external link", "soft link out", "external storage", "virtual", "empty"]

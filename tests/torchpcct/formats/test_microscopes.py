@@ -69,6 +69,50 @@ def test_nikon_with_another_axis_and_without_a_value(tmp_path):
         open_scan(path)
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("Projections", 24.5, r"Projections must be a whole number, got '24\.5'"),
+        ("DetectorPixelsX", 48.5, r"DetectorPixelsX must be a whole number, got '48\.5'"),
+        ("AngularStep", 0, "AngularStep is 0 and there are 24 Projections: the object has not"),
+    ],
+)
+def test_nikon_with_a_number_that_cannot_be(tmp_path, name, value, said):
+    readings = np.full(NIKON.shape, 0.5 * WHITE)
+    path = xtekct(tmp_path / "part", readings, NIKON, WHITE, **{name: value})
+    with pytest.raises(ValueError, match=said):
+        open_scan(path)
+
+
+def test_nikon_images_that_do_not_count_on(tmp_path):
+    readings = np.full(NIKON.shape, 0.5 * WHITE)
+    path = xtekct(tmp_path / "part", readings, NIKON, WHITE)
+    (path.parent / "part_0005.tif").rename(path.parent / "part_0025.tif")
+    with pytest.raises(ValueError, match=r"evenly: part_0006\.tif follows part_0004\.tif; a view"):
+        open_scan(path)
+    (path.parent / "part_0025.tif").rename(path.parent / "part_0005.tif")
+    for k in range(24, 0, -1):  # every second view of a longer scan
+        (path.parent / f"part_{k:04d}.tif").rename(path.parent / f"part_{2 * k:04d}.tif")
+    assert open_scan(path).geometry.views == 24
+
+
+def test_nikon_in_an_encoding_of_windows(tmp_path):
+    readings = np.full(NIKON.shape, 0.5 * WHITE)
+    path = xtekct(tmp_path / "part", readings, NIKON, WHITE)
+    text = path.read_text(encoding="utf-8-sig") + "Operator=M\u00fcller\n"
+    path.write_bytes(text.encode("cp1252"))
+    assert open_scan(path).geometry.views == 24
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_zeiss_with_shifts_that_are_no_numbers(tmp_path, wrong):
+    readings = np.full(ZEISS.shape, 0.5 * WHITE)
+    shifts = {"x": np.where(np.arange(24) == 3, wrong, 2.0)}
+    path = txrm(tmp_path / "a.txrm", readings, ZEISS, np.full((4, 48), WHITE), shifts)
+    with pytest.raises(ValueError, match=r"x-shifts of image 4 is (nan|inf), no shift: export"):
+        open_scan(path)
+
+
 def test_zeiss(tmp_path):
     lines = line_integrals(ZEISS, BODY, sub=1)
     path = txrm(tmp_path / "a.txrm", WHITE * np.exp(-lines), ZEISS, np.full((4, 48), WHITE))
@@ -161,3 +205,17 @@ def test_matlab_readings_stacks_and_arrays_that_leave_it_open(tmp_path):
         ValueError, match=r"c\.mat cannot be read as a MATLAB file: its variable holds complex128"
     ):
         open_scan(tmp_path / "c.mat", PARALLEL)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "said"),
+    [
+        ({"s": SINOGRAM > 0.1}, "it holds no array of numbers of its own: structures, cells"),
+        ({"s": {"sinogram": SINOGRAM}}, "it holds no array of numbers of its own: structures"),
+        ({"s": SINOGRAM.ravel()}, r"only s \(1, 1920\): save the readings with an axis of views"),
+    ],
+)
+def test_matlab_files_without_an_array_say_what_to_save(tmp_path, arrays, said):
+    savemat(tmp_path / "s.mat", arrays)
+    with pytest.raises(ValueError, match=said):
+        open_scan(tmp_path / "s.mat", PARALLEL)
