@@ -66,8 +66,14 @@ def speak_any_encoding() -> None:
 
 
 def require_folder(path: str | os.PathLike[str]) -> None:
-    """Raise ``FileNotFoundError`` unless the folder that ``path`` would be written to exists."""
+    """Raise ``FileNotFoundError`` unless the folder that ``path`` would be written to exists, or
+    ``NotADirectoryError`` if a file is in its place."""
     parent = Path(path).parent
+    taken = next((each for each in (parent, *parent.parents) if each.exists()), None)
+    if taken is not None and not taken.is_dir():
+        raise NotADirectoryError(
+            f"cannot write {path}: {taken} is a file, no folder; choose another folder"
+        )
     if not parent.is_dir():
         raise FileNotFoundError(
             f"cannot write {path}: the folder {parent} does not exist, create it first"

@@ -12,7 +12,7 @@ import pytest
 from fresh_python import run_python
 
 from recon.jobs.store import Store
-from torchpcct.files import WriteError, atomic_write, write_hdf5
+from torchpcct.files import WriteError, atomic_write, require_folder, write_hdf5
 
 FULL = """
 import os, resource, sys
@@ -141,3 +141,12 @@ def test_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         write("new")
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["f"]
+
+
+def test_a_file_in_the_place_of_the_folder_is_named(tmp_path):
+    (tmp_path / "taken").write_text("mine", encoding="utf-8")
+    for name in ("taken/a.h5", "taken/deeper/a.h5"):
+        with pytest.raises(NotADirectoryError, match=r"taken is a file, no folder; choose another"):
+            require_folder(tmp_path / name)
+    with pytest.raises(FileNotFoundError, match="missing does not exist, create it first"):
+        require_folder(tmp_path / "missing" / "a.h5")
