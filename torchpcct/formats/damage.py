@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -176,8 +176,8 @@ def yaml_values(text: str) -> object:
     number of values.
 
     Raises:
-        ValueError: no YAML; deeper, or of more values with its aliases written out, than any
-            description is.
+        ValueError: no YAML; a name given twice; deeper, or of more values with its aliases written
+            out, than any description is.
     """
     import yaml
 
@@ -186,6 +186,7 @@ def yaml_values(text: str) -> object:
     loader: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
         _check_yaml(yaml.parse(text, Loader=loader))
+        _check_keys(yaml.compose(text, Loader=loader))
         return yaml.load(text, Loader=loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
@@ -193,6 +194,33 @@ def yaml_values(text: str) -> object:
         raise ValueError(
             f"it is not YAML: {getattr(error, 'problem', None) or error}{where}"
         ) from error
+
+
+def _check_keys(root: Any) -> None:
+    """Refuse names that a mapping has twice, of which YAML takes the last without a word."""
+    import yaml
+
+    nodes: list[Any] = [root]
+    seen: set[int] = set()
+    while nodes:
+        node = nodes.pop()
+        if not isinstance(node, yaml.CollectionNode) or id(node) in seen:
+            continue
+        seen.add(id(node))  # aliases are the same node
+        if not isinstance(node, yaml.MappingNode):
+            nodes.extend(node.value)
+            continue
+        lines: dict[object, int] = {}
+        for key, value in node.value:
+            nodes.append(value)
+            if isinstance(key, yaml.ScalarNode) and key.value != "<<":
+                line = key.start_mark.line + 1
+                if key.value in lines:
+                    raise ValueError(
+                        f"it has {key.value} twice, in line {lines[key.value]} and line {line}: "
+                        "leave one out"
+                    )
+                lines[key.value] = line
 
 
 def _check_yaml(events: Iterable[object]) -> None:

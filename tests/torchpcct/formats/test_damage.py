@@ -8,6 +8,8 @@ import sys
 import damage
 import pytest
 
+from torchpcct.formats.damage import yaml_values
+
 COPIES = 60
 MINUTES = float(os.environ.get("TORCHPCCT_FUZZ_MINUTES", "10"))
 """For all readers together, in the slow test."""
@@ -42,3 +44,12 @@ def test_fuzzed_readers(reader, tmp_path):
     _check(reader, found)
     assert found["refused"] > 0
     print(f"{reader}: {found}")
+
+
+def test_a_name_twice_in_a_mapping_is_refused():
+    for text in ("a: 1\nb: 2\na: 3\n", "x: [{a: 1, b: 2,\n\n a: 1}]"):
+        with pytest.raises(ValueError, match="it has a twice, in line 1 and line 3: leave one out"):
+            yaml_values(text)
+    sound = "a: &a {n: 1, m: 2}\nb: {<<: *a, n: 3}\nc: [*a, *a]\n"
+    assert yaml_values(sound)["b"] == {"n": 3, "m": 2}
+    assert yaml_values("") is None
