@@ -8,6 +8,7 @@ import importlib
 import io
 import math
 import os
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -186,7 +187,7 @@ def yaml_values(text: str) -> object:
     loader: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
         _check_yaml(yaml.parse(text, Loader=loader))
-        _check_keys(yaml.compose(text, Loader=loader))
+        _check_nodes(yaml.compose(text, Loader=loader))
         return yaml.load(text, Loader=loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
@@ -196,14 +197,23 @@ def yaml_values(text: str) -> object:
         ) from error
 
 
-def _check_keys(root: Any) -> None:
-    """Refuse names that a mapping has twice, of which YAML takes the last without a word."""
+_SIXTIES = re.compile(r"[-+]?[0-9_]+(:[0-9_]+)+(\.[0-9_]*)?")
+"""What YAML 1.1 reads to the base of 60."""
+_OCTAL = re.compile(r"[-+]?0[0-7_]+")
+"""What YAML 1.1 reads to the base of 8."""
+
+
+def _check_nodes(root: Any) -> None:
+    """Refuse what YAML reads otherwise than it looks, without a word: names that a mapping has
+    twice, of which it takes the last, and numbers to another base."""
     import yaml
 
     nodes: list[Any] = [root]
     seen: set[int] = set()
     while nodes:
         node = nodes.pop()
+        if isinstance(node, yaml.ScalarNode):
+            _check_base(node)
         if not isinstance(node, yaml.CollectionNode) or id(node) in seen:
             continue
         seen.add(id(node))  # aliases are the same node
@@ -221,6 +231,20 @@ def _check_keys(root: Any) -> None:
                         "leave one out"
                     )
                 lines[key.value] = line
+
+
+def _check_base(node: Any) -> None:
+    """Refuse a number that YAML 1.1 reads to the base of 8 or 60."""
+    if node.style or not node.tag.endswith((":int", ":float")):
+        return
+    digits = node.value.replace("_", "")
+    octal = _OCTAL.fullmatch(node.value) and int(digits, 8) != int(digits)
+    if octal or _SIXTIES.fullmatch(node.value):
+        raise ValueError(
+            f"its {node.value[:30]} in line {node.start_mark.line + 1} is a number to the base of "
+            f"{8 if octal else 60} in YAML: write it without leading zeros and colons, or a text "
+            "in quotes"
+        )
 
 
 def _check_yaml(events: Iterable[object]) -> None:

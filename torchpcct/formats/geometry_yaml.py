@@ -171,6 +171,10 @@ def angles_of(value: object, folder: Path = Path(), views: int | None = None) ->
     return found
 
 
+_MOST_VIEWS = 10**7
+"""More are a slip of the pen: their angles alone would fill the memory."""
+
+
 def _angles(value: object, folder: Path) -> Floats:
     if isinstance(value, Mapping):
         unknown = sorted(map(str, set(value) - {"start", "step", "count"}))
@@ -179,7 +183,7 @@ def _angles(value: object, folder: Path) -> Floats:
                 f"angles_deg must be {{start, step, count}}, a list or a file's name, got "
                 f"{dict(value)!r:.200}"
             )
-        count = whole("angles_deg.count", value["count"])
+        count = whole("angles_deg.count", value["count"], high=_MOST_VIEWS)
         step = number("angles_deg.step", value["step"], unit="°")
         start = number("angles_deg.start", value.get("start", 0.0), unit="°")
         return np.deg2rad(start + step * np.arange(count))

@@ -46,6 +46,20 @@ def test_fuzzed_readers(reader, tmp_path):
     print(f"{reader}: {found}")
 
 
+@pytest.mark.parametrize(
+    ("text", "base"), [("a: 1\nsod: 0300", 8), ("a: 1\nsod: -0_17", 8), ("a: 1\nsod: 5:00", 60)]
+)
+def test_numbers_to_another_base_are_refused(text, base):
+    """``0300`` is 192 in YAML, ``5:00`` is 300."""
+    with pytest.raises(ValueError, match=f"in line 2 is a number to the base of {base}"):
+        yaml_values(text)
+
+
+def test_numbers_as_they_look():
+    text = "{a: 300, b: 0, c: 07, d: 0.5, e: -1e3, f: '5:00', g: 1_000, h: 0x1f, i: 10:75 h}"
+    assert list(yaml_values(text).values()) == [300, 0, 7, 0.5, "-1e3", "5:00", 1000, 31, "10:75 h"]
+
+
 def test_a_name_twice_in_a_mapping_is_refused():
     for text in ("a: 1\nb: 2\na: 3\n", "x: [{a: 1, b: 2,\n\n a: 1}]"):
         with pytest.raises(ValueError, match="it has a twice, in line 1 and line 3: leave one out"):

@@ -160,6 +160,9 @@ def test_angles_start_where_they_are_said_to(tmp_path):
     (tmp_path / "stack.yaml").write_text(yaml.safe_dump(text), encoding="utf-8")
     for geometry in (geometry_of(written), open_scan(tmp_path / "stack.yaml").geometry):
         assert np.rad2deg(geometry.angles) == pytest.approx([30, 32, 34, 36])
+    written["angles_deg"]["count"] = 10**12
+    with pytest.raises(ValueError, match=r"angles_deg\.count must be at most 10000000"):
+        geometry_of(written)
 
 
 @pytest.mark.parametrize("frames", ["constant", "one", "averaged"])
