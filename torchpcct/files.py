@@ -69,10 +69,15 @@ def require_folder(path: str | os.PathLike[str]) -> None:
     """Raise ``FileNotFoundError`` unless the folder that ``path`` would be written to exists, or
     ``NotADirectoryError`` if a file is in its place."""
     parent = Path(path).parent
-    taken = next((each for each in (parent, *parent.parents) if each.exists()), None)
-    if taken is not None and not taken.is_dir():
+    for folder in (parent, *parent.parents):
+        try:
+            mode = folder.stat().st_mode  # once: it may be removed and made again meanwhile
+        except OSError:
+            continue
+        if stat.S_ISDIR(mode):
+            break
         raise NotADirectoryError(
-            f"cannot write {path}: {taken} is a file, no folder; choose another folder"
+            f"cannot write {path}: {folder} is a file, no folder; choose another folder"
         )
     if not parent.is_dir():
         raise FileNotFoundError(

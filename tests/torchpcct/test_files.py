@@ -150,3 +150,19 @@ def test_a_file_in_the_place_of_the_folder_is_named(tmp_path):
             require_folder(tmp_path / name)
     with pytest.raises(FileNotFoundError, match="missing does not exist, create it first"):
         require_folder(tmp_path / "missing" / "a.h5")
+
+
+def test_a_folder_that_is_removed_meanwhile_is_no_file(tmp_path, monkeypatch):
+    """Between two looks at it, by another process."""
+    folder, look = tmp_path / "cache", Path.stat
+    folder.mkdir()
+
+    def looked_at(path, **options):
+        found = look(path, **options)
+        if path == folder:
+            folder.rmdir()
+        return found
+
+    monkeypatch.setattr(Path, "stat", looked_at)
+    with pytest.raises(FileNotFoundError, match="cache does not exist, create it first"):
+        require_folder(folder / "a.h5")
