@@ -90,8 +90,8 @@ def add_reader_options(parser: Parser, many: bool = False) -> None:
             "--angles-deg",
             _angles,
             "FILE|START:STEP",
-            "angles of Data Exchange and NeXus in degrees: a text file with one a line, or the "
-            "first and their step",
+            "angles of Data Exchange, NeXus and Nikon in degrees: a text file with one a line, or "
+            "the first and their step",
         ),
         (
             "--air",

@@ -148,9 +148,9 @@ def xtekct(folder: Path, readings, geometry, white: float, start: float = 30.0, 
     return folder / "part.xtekct"
 
 
-def txrm(path: Path, readings, geometry, air, shifts=None) -> Path:
+def txrm(path: Path, readings, geometry, air, shifts=None, **more) -> Path:
     """A Zeiss scan of a cone beam that turns clockwise from −90°: uint16 images, a float
-    reference, mm and µm."""
+    reference, mm and µm; ``more`` of ``ImageInfo``."""
     g = geometry
     degrees = -np.rad2deg(g.angles) - 90.0
     voxel = 1e3 * g.pitch[1] * g.sod / g.sdd
@@ -164,6 +164,7 @@ def txrm(path: Path, readings, geometry, air, shifts=None) -> Path:
         "ImageInfo/StoRADistance": np.full(g.views, -g.sod, "<f4"),
         "ImageInfo/DtoRADistance": np.full(g.views, g.sdd - g.sod, "<f4"),
         "ImageInfo/XrayGeometry": np.int32(1),
+        **{f"ImageInfo/{name}": value for name, value in more.items()},
         "ReferenceData/DataType": np.uint32(10),
         "ReferenceData/Image": np.asarray(air, "<f4"),
         **{

@@ -225,25 +225,26 @@ class _Probe:
         return np.log(air) - np.log(readings[0])
 
 
-def _detector_effects(scanner: Scanner) -> list[Effect]:
-    """Pile-up, charge sharing and afterglow, as the scanner's detector has them; afterglow
-    last."""
-    afterglow = "afterglow, readout cross-talk"
-    if scanner.detector.energy_integrating:
-        return [
-            Effect("pile-up, charge sharing", False, None, "the detector counts no pulses"),
-            Effect(afterglow, False, None, "every signal is read in its own view and cell"),
-        ]
-    foils = Effect(
-        afterglow, False, None, "counting silicon has no afterglow; tungsten foils part the columns"
+def _afterglow(scanner: Scanner) -> Effect:
+    reason = (
+        "every signal is read in its own view and cell"
+        if scanner.detector.energy_integrating
+        else "counting silicon has no afterglow; tungsten foils part the columns"
     )
+    return Effect("afterglow, readout cross-talk", False, None, reason)
+
+
+def _pulse_effects(scanner: Scanner) -> list[Effect]:
+    """Pile-up and charge sharing, as the scanner's detector has them."""
+    if scanner.detector.energy_integrating:
+        return [Effect("pile-up, charge sharing", False, None, "the detector counts no pulses")]
     dead_ns, merge_ns, shared = (
         float(getattr(scanner.detector, name, 0.0))
         for name in ("dead_time_ns", "merge_ns", "charge_sharing")
     )
     far = "behind the body the count rate is far below the detector's limit"
     if not (dead_ns or shared):
-        return [Effect("pile-up, charge sharing", False, None, far), foils]
+        return [Effect("pile-up, charge sharing", False, None, far)]
     lost = (
         f"dead time {dead_ns:g} ns, merging time {merge_ns:g} ns at "
         f"{scanner.source.current_ma:g} mA"
@@ -252,7 +253,6 @@ def _detector_effects(scanner: Scanner) -> list[Effect]:
     return [
         Effect("pile-up", dead_ns > 0, None, lost if dead_ns else far),
         Effect("charge sharing", shared > 0, None, split),
-        foils,
     ]
 
 
@@ -323,8 +323,7 @@ def make_plan(
         omitted = cost(probe.run(everything, _EFFECT_SUB_RAYS, still=True) - reference)
         effects.append(Effect("motion", True, omitted, "exact in every view"))
     scatter, *beam = (Effect(name, False, None, note) for name, note in _LEFT_OUT)
-    *pulses, afterglow = _detector_effects(scanner)
-    effects += [scatter, *pulses, *beam, afterglow]
+    effects += [scatter, *_pulse_effects(scanner), *beam, _afterglow(scanner)]
 
     # Full-sampled reference with only the chosen effects: what the number of sub-rays must
     # reproduce.

@@ -294,9 +294,9 @@ def _by_ends(lines: Floats, turn: Floats) -> tuple[float, float]:
     onward = [(1 + lack) * ends[0] - lack * ends[1], (1 + lack) * ends[3] - lack * ends[2]]
     mirrors = [CubicSpline(at, ends[3]), CubicSpline(at, ends[0])]
 
-    def compared(column: float) -> tuple[Floats, Floats, Floats, Floats]:
-        """Of the readings that have a counterpart: differences, slopes, their power, squares of
-        the readings."""
+    def compared(column: float) -> tuple[int, Floats, Floats, Floats, Floats]:
+        """Of the readings that have a counterpart: how many of each end they are, differences,
+        slopes, their power, squares of the readings."""
         there = 2 * column - at
         inside = (there >= 0) & (there <= columns - 1)
         parts = []
@@ -308,35 +308,30 @@ def _by_ends(lines: Floats, turn: Floats) -> tuple[float, float]:
         differences, slopes, power, levels = (
             np.where(inside, np.stack(v), 0.0) for v in zip(*parts, strict=True)
         )
-        return differences, slopes, power, levels
+        return int(inside.sum()), differences, slopes, power, levels
 
     most = 2.0 * float((ends[[0, 3]] ** 2).sum())
 
-    def unlike(column: float) -> float:
-        differences, _, _, levels = compared(column)
-        # Air is like air: a part of what the ends show must be compared.
-        return (
-            float((differences**2).sum() / levels.sum())
-            if levels.sum() > _COMPARED * most
-            else math.inf
-        )
-
-    def scatter(column: float) -> tuple[float, float]:
-        """Mean squared difference, and the relative standard error of that of noise."""
-        there = 2 * column - at
-        count = max(int(((there >= 0) & (there <= columns - 1)).sum()), 1)
+    def unlike(column: float) -> tuple[float, float, float]:
+        """Mean squared difference at a place of the axis over what the ends show, the mean itself,
+        and the relative standard error of that of noise."""
+        count, differences, _, _, levels = compared(column)
         # Both ends compare the same readings, and smoothing ties neighbours.
         independent = max(count / (2.0 * math.sqrt(math.pi) * width), 1.0)
-        return float((compared(column)[0] ** 2).sum()) / count, 2.0 / independent
+        total, shown = float((differences**2).sum()), float(levels.sum())
+        # Air is like air: a part of what the ends show must be compared.
+        relative = total / shown if shown > _COMPARED * most else math.inf
+        return relative, total / max(count, 1), 2.0 / independent
 
     reach = int(_REACH * columns)
     places = (columns - 1) / 2 + np.arange(-reach, reach + 1)
-    differing = np.array([unlike(c) for c in places])
+    found = [unlike(float(c)) for c in places]
+    differing = np.array([relative for relative, _, _ in found])
     column = float(places[int(np.argmin(differing))])
     if differing.min() > _UNLIKE:
         return math.nan, math.inf
     for _ in range(12):
-        differences, slopes, power, _ = compared(column)
+        _, differences, slopes, power, _ = compared(column)
         total = float(power.sum())
         if total <= 0:
             return math.nan, math.inf
@@ -349,10 +344,10 @@ def _by_ends(lines: Floats, turn: Floats) -> tuple[float, float]:
         for b in np.array_split(slopes * differences - move * power, _BLOCKS, axis=-1)
     ]
     error = _TIED * math.sqrt(np.square(scores).sum() * _BLOCKS / (_BLOCKS - 1)) / total
-    least, uncertain = scatter(column)
+    _, least, uncertain = unlike(column)
     far = np.abs(places - column) > max(_NEARBY, 2.0 * _SIGMAS * error)
-    for place in places[far & np.isfinite(differing)]:
-        there, also = scatter(float(place))
+    for at_place in np.flatnonzero(far & np.isfinite(differing)):
+        _, there, also = found[at_place]
         if there <= least * (1.0 + _ALIKE_SIGMAS * math.sqrt(uncertain + also)):
             return math.nan, math.inf  # as alike as at the axis
     return float(column), error

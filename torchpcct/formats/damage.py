@@ -157,19 +157,30 @@ def _table(text: str) -> Array:
     Raises:
         ValueError: no numbers, or a word that is none.
     """
-    rows = [line.split("#", 1)[0].split() for line in text.splitlines()]
-    if not any(rows):
+    rows = (line.split("#", 1)[0] for line in text.splitlines())
+    if not any(row.strip() for row in rows):
         raise ValueError("it holds no numbers")
-    for number, words in enumerate(rows, start=1):
-        for word in words:
+    try:
+        return np.loadtxt(io.StringIO(text), dtype=np.float64)
+    except ValueError as error:
+        where = _no_number(text)
+        if where is None:
+            raise
+        raise ValueError(
+            f"{where} is no number: write numbers with a decimal point, columns apart by blanks, "
+            "and # before a comment"
+        ) from error
+
+
+def _no_number(text: str) -> str | None:
+    """The first word of a table that is no number, and its line."""
+    for number, line in enumerate(text.splitlines(), start=1):
+        for word in line.split("#", 1)[0].split():
             try:
                 float(word)
-            except ValueError as error:
-                raise ValueError(
-                    f"{word[:30]!r} in line {number} is no number: write numbers with a decimal "
-                    "point, columns apart by blanks, and # before a comment"
-                ) from error
-    return np.loadtxt(io.StringIO(text), dtype=np.float64)
+            except ValueError:
+                return f"{word[:30]!r} in line {number}"
+    return None
 
 
 def yaml_values(text: str) -> object:
@@ -187,14 +198,23 @@ def yaml_values(text: str) -> object:
     loader: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
         _check_yaml(yaml.parse(text, Loader=loader))
-        _check_nodes(yaml.compose(text, Loader=loader))
-        return yaml.load(text, Loader=loader)
+        return _constructed(loader(text))
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = "" if mark is None else f" in line {mark.line + 1}, column {mark.column + 1}"
         raise ValueError(
             f"it is not YAML: {getattr(error, 'problem', None) or error}{where}"
         ) from error
+
+
+def _constructed(loader: Any) -> object:
+    """Values of the one document of a loader, once its nodes are checked."""
+    try:
+        node = loader.get_single_node()
+        _check_nodes(node)
+        return None if node is None else loader.construct_document(node)
+    finally:
+        loader.dispose()
 
 
 _SIXTIES = re.compile(r"[-+]?[0-9_]+(:[0-9_]+)+(\.[0-9_]*)?")

@@ -18,8 +18,8 @@ import numpy as np
 from torchpcct.formats.arrays import given_array
 from torchpcct.formats.damage import check_expansion, check_size, reading
 from torchpcct.formats.geometry_yaml import angles_of
+from torchpcct.formats.integer_readings import as_counted
 from torchpcct.formats.lengths import MM, RAD, unit_text
-from torchpcct.formats.signed_readings import unwrapped
 from torchpcct.geometry import ParallelBeam
 from torchpcct.hdf5 import inside
 from torchpcct.readings import TRANSFER_FRAMES
@@ -45,6 +45,8 @@ _HALF_TURNS = 4
 """Angles without a unit that end within a step of so many half turns, or fewer, are in rad."""
 _LARGEST_UNNAMED_MM = 10.0
 """Largest pixel whose size has no unit: it is in m as the format says, or nobody knows in what."""
+_SAME_SIZE = 1e-4
+"""Relative difference of pixel sizes that are the same."""
 _LARGEST_RAD = 7.0
 """Ranges of angles without a unit that may be either, if they are no half turns: beyond it they
 are degrees."""
@@ -103,7 +105,7 @@ class Frames(NamedTuple):
         if self.rows is not None:
             info["slices"] = self.rows
         geometry = ParallelBeam(self.angles, self.data.shape[2], pitch)
-        held = unwrapped({"readings": self.data, "air": self.white, "dark": self.dark}, self.path)
+        held = as_counted({"readings": self.data, "air": self.white, "dark": self.dark}, self.path)
         white = np.asarray(held["air"])
         if options.get("gain") is None and (white.ndim < 3 or len(white) < TRANSFER_FRAMES):
             options["gain"] = "noise"
@@ -280,11 +282,14 @@ def angles_in(data: h5py.Dataset, views: int, what: str, of: slice | Bools = sli
 
 
 def length_in(data: h5py.Dataset) -> tuple[float | None, str]:
-    """A length in mm of a data set of one number, None if it has no known unit or is none; and
-    what it says."""
+    """A length in mm of a data set of one number, or of equal ones, None if it has no known unit
+    or is none; and what it says."""
     written = "units" in data.attrs
     unit = unit_text(data.attrs["units"]) if written else "m"
-    value = float(np.ravel(data[()])[0])
+    sizes = np.ravel(data[()]).astype(np.float64)
+    if sizes.size > 1 and not float(np.ptp(sizes)) <= _SAME_SIZE * abs(float(sizes[0])):
+        return None, f"the file has pixels of {sizes.min():g} to {sizes.max():g} {unit}, not of one"
+    value = float(sizes[0]) if sizes.size else math.nan
     known = unit in MM and math.isfinite(value) and value > 0
     if not written and known and value * MM[unit] > _LARGEST_UNNAMED_MM:
         return None, f"the file's pixel size is {value:g} without a unit, no size in m"

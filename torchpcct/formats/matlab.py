@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from torchpcct.formats.arrays import given_array, read_mat
-from torchpcct.formats.signed_readings import unwrapped
+from torchpcct.formats.integer_readings import as_counted
 from torchpcct.geometry import Geometry
 from torchpcct.scan import Scan
 
@@ -59,7 +59,7 @@ def read_mat_scan(
         return Scan.from_line_integrals(
             _in_order(values, geometry, path), geometry, info=info, **options
         )
-    held = unwrapped(
+    held = as_counted(
         {
             "readings": _in_order(values, geometry, path),
             "air": air,

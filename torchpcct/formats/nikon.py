@@ -19,7 +19,8 @@ import numpy as np
 from torchpcct.formats.arrays import given_array, read_array
 from torchpcct.formats.damage import read_text, reading
 from torchpcct.formats.file_names import in_number_order
-from torchpcct.formats.signed_readings import unwrapped
+from torchpcct.formats.geometry_yaml import angles_of
+from torchpcct.formats.integer_readings import as_counted
 from torchpcct.geometry import ConeBeam
 from torchpcct.scan import Scan
 from torchpcct.scan_file import sliced
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from torchpcct.typing import CountsOptions
+    from torchpcct.typing import CountsOptions, Floats
 
 
 __all__ = ["read_xtekct"]
@@ -49,12 +50,16 @@ _NEEDED = (
 """Entries that an .xtekct file must have."""
 _STRAIGHT_DEG = 1e-3
 """Tilt of the object's axis that does not matter."""
+_UNEVEN = 0.5
+"""Steps of the turn by which listed angles may differ from even ones, as a table's do that is
+read out while it turns."""
 
 
 def read_xtekct(
     path: str | os.PathLike[str],
     *,
     slices: slice | None = None,
+    angles_deg: object = None,
     air: ArrayLike | str | os.PathLike[str] | None = None,
     dark: ArrayLike | str | os.PathLike[str] = 0.0,
     mu_water: float | None = None,
@@ -67,6 +72,10 @@ def read_xtekct(
     Args:
         path: ``.xtekct`` file.
         slices: detector rows to read, counted upwards; None: all.
+        angles_deg: of the object in degrees, a list, the name of a file or a mapping of start and
+            step; None: the file's ``InitialAngle`` and ``AngularStep``. Programs read the lists of
+            angles that may lie beside it (``.ang``, ``_ctdata.txt``) in both directions: a warning
+            says where they do not go on evenly.
         air: reading without the object; None: the file's ``WhiteLevel``.
         dark, mu_water, options: of :meth:`torchpcct.Scan.from_counts`; ``gain`` by default from the
             noise.
@@ -95,11 +104,7 @@ def read_xtekct(
         views, columns, rows = (
             int(values[k]) for k in ("Projections", "DetectorPixelsX", "DetectorPixelsY")
         )
-        if not values["AngularStep"] and views > 1:
-            raise ValueError(
-                f"AngularStep is 0 and there are {views} Projections: the object has not turned; "
-                "write the step in degrees"
-            )
+        turned = _turned(Path(path), about, values["AngularStep"], views, angles_deg)
         magnification = values["SrcToDetector"] / values["SrcToObject"]
         top, bottom = (_optional(about, f"CentreOfRotation{end}") for end in ("Top", "Bottom"))
         moved = about.get("ObjectOffsetX", "").strip()
@@ -115,11 +120,8 @@ def read_xtekct(
                     UserWarning,
                     stacklevel=2,
                 )
-        angles = np.deg2rad(
-            90.0 + _optional(about, "InitialAngle") + values["AngularStep"] * np.arange(views)
-        )
         geometry = ConeBeam(
-            angles,
+            turned + np.pi / 2,
             values["SrcToObject"],
             values["SrcToDetector"],
             columns,
@@ -143,7 +145,7 @@ def read_xtekct(
         raise ValueError(f"{path}: its images have the shape {readings.shape}, it says {expected}")
     options.setdefault("gain", "noise")
     white = values["WhiteLevel"] if air is None else given_array(air)
-    held = unwrapped(
+    held = as_counted(
         {"readings": readings[:, ::-1, ::-1], "air": white, "dark": given_array(dark)}, str(path)
     )
     return Scan.from_counts(
@@ -154,6 +156,52 @@ def read_xtekct(
 def _optional(about: Mapping[str, str], name: str) -> float:
     text = about.get(name, "").strip()
     return number(name, text) if text else 0.0
+
+
+def _turned(path: Path, about: Mapping[str, str], step: float, views: int, given: object) -> Floats:
+    """Angles of the object in rad."""
+    if given is not None:
+        return angles_of(given, path.parent, views)
+    if not step and views > 1:
+        raise ValueError(
+            f"AngularStep is 0 and there are {views} Projections: the object has not turned; "
+            "write the step in degrees"
+        )
+    even = step * np.arange(views)
+    for beside in (path.with_suffix(".ang"), path.parent / "_ctdata.txt"):
+        if not beside.is_file():
+            continue
+        listed = _listed(read_text(beside, "a list of angles", other="cp1252"))
+        if listed.size != views:
+            raise ValueError(f"{beside.name} lists {listed.size} angles of {views} Projections")
+        turn = np.abs(listed - listed[0])
+        # Tables count on beyond a turn, or begin again.
+        off = np.abs((turn - np.abs(even) + 180.0) % 360.0 - 180.0)
+        if off.max() > _UNEVEN * abs(step):
+            warnings.warn(
+                f"{path}: {beside.name} lists angles that do not go on by AngularStep ({step:g}°; "
+                f"view {int(off.argmax()) + 1} is {off.max():.3g}° off), which is what is taken: "
+                "give angles_deg= if the list is right",
+                UserWarning,
+                stacklevel=3,
+            )
+    return np.deg2rad(_optional(about, "InitialAngle") + even)
+
+
+_LINE = re.compile(r"\s*\d+[:,\s]\s*([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\b")
+"""Number of a view, and its angle in degrees."""
+
+
+def _listed(text: str) -> Floats:
+    """Angles in degrees of the lines after the last heading, which may hold numbers, too."""
+    found: list[str] = []
+    for line in text.splitlines():
+        match = _LINE.match(line)
+        if match:
+            found.append(match.group(1))
+        elif line.strip():
+            found.clear()
+    return np.array(found, dtype=np.float64)
 
 
 def _images(path: Path, about: Mapping[str, str], views: int) -> list[Path]:

@@ -116,7 +116,11 @@ _READERS = (
     ),
     _Reader("CatSim's readings", _CATSIM, _any, _catsim, frozenset(_COUNTS), "given"),
     _Reader(
-        "a Nikon scan", (".xtekct",), _any, read_xtekct, frozenset({"slices"} | _FRAMES | _COUNTS)
+        "a Nikon scan",
+        (".xtekct",),
+        _any,
+        read_xtekct,
+        frozenset({"slices", "angles_deg"} | _FRAMES | _COUNTS),
     ),
     _Reader("a Zeiss scan", (".txrm",), _any, read_txrm, frozenset({"slices"} | _FRAMES | _COUNTS)),
     _Reader(

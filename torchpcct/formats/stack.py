@@ -13,7 +13,7 @@ import numpy as np
 from torchpcct.formats.arrays import read_array
 from torchpcct.formats.damage import read_yaml, reading
 from torchpcct.formats.geometry_yaml import geometry_of
-from torchpcct.formats.signed_readings import unwrapped
+from torchpcct.formats.integer_readings import as_counted
 from torchpcct.geometry import Geometry
 from torchpcct.scan import Scan
 from torchpcct.scan_file import slice_axis, sliced
@@ -148,7 +148,7 @@ def read_stack(
             "readings": readings,
             **{k: options[k] for k in ("air", "dark") if k in options},
         }
-        held = unwrapped(held, str(path))
+        held = as_counted(held, str(path))
         readings = held.pop("readings")
         options |= held
     if not geometry.has_rows and readings.ndim == 3 and readings.shape[0] == geometry.views:

@@ -14,7 +14,7 @@ import numpy as np
 
 from torchpcct.formats.arrays import given_array
 from torchpcct.formats.damage import check_expansion, needed, reading
-from torchpcct.formats.signed_readings import unwrapped
+from torchpcct.formats.integer_readings import as_counted
 from torchpcct.geometry import ConeBeam, Geometry, ParallelBeam
 from torchpcct.scan import Scan
 from torchpcct.scan_file import slice_axis, sliced
@@ -38,6 +38,8 @@ _A_STORAGE = 100
 """Images of a storage ``ImageData1``, ``ImageData2``, …"""
 _STILL = 1e-3
 """Shift of an image, in cells, that is none."""
+_SAME_PLACE = 1e-3
+"""Relative difference of distances that are the same."""
 
 
 def read_txrm(
@@ -101,7 +103,7 @@ def read_txrm(
             reference = _type(held.numbers(of, "<u4")[0]) if file.exists(of) else kind
             air = held.image("ReferenceData/Image", reference, height, width)[rows]
         options.setdefault("gain", "noise")
-        arrays = unwrapped(
+        arrays = as_counted(
             {"readings": readings, "air": given_array(air), "dark": given_array(dark)}, str(path)
         )
         readings = arrays.pop("readings")
@@ -134,6 +136,21 @@ class _Streams:
             raise ValueError(f"its {name} holds {len(content) // size} of {count} numbers")
         return np.frombuffer(content, kind, count)
 
+    def distance(self, name: str, count: int) -> float:
+        """A distance in mm of all images, which may stand there for each of them."""
+        first = self.numbers(name, "<f4")[0]
+        size = self.file.get_size(name) // np.dtype("<f4").itemsize
+        each = np.abs(self.numbers(name, "<f4", min(size, count)).astype(np.float64))
+        # Of a scan that was stopped the rest may be 0.
+        other = np.flatnonzero((np.abs(each - each[0]) > _SAME_PLACE * each[0]) & (each != 0))
+        if other.size:
+            raise ValueError(
+                f"its {name} is {each[0]:g} mm of image 1 and {each[other[0]]:g} mm of image "
+                f"{other[0] + 1}: the axis or the detector was moved; export the images of one "
+                "distance, or make a stack of them with a geometry of vectors"
+            )
+        return number(name, abs(float(first)), positive=True, unit="mm")
+
     def image(self, name: str, kind: str, height: int, width: int) -> Array:
         return self.numbers(name, kind, height * width).reshape(height, width)
 
@@ -157,7 +174,7 @@ def _geometry(held: _Streams, count: int, height: int, width: int) -> Geometry:
     if not cone:
         return ParallelBeam(angles, width, cell)
     sod, beyond = (
-        number(name, abs(float(held.numbers(name, "<f4")[0])), positive=True, unit="mm")
+        held.distance(name, count)
         for name in ("ImageInfo/StoRADistance", "ImageInfo/DtoRADistance")
     )
     pitch = cell * (sod + beyond) / sod  # the files say the size of a voxel

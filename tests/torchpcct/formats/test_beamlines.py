@@ -109,6 +109,38 @@ def test_uint16_that_was_stored_as_int16(exchange):
         close(open_scan(exchange))
 
 
+@pytest.mark.parametrize("name", ["data", "data_white"])
+def test_readings_at_the_end_of_their_type(exchange, name):
+    with h5py.File(exchange, "a") as file:
+        held = {"data": DATA, "data_white": WHITE}[name].astype(np.uint16)
+        few = held.copy()
+        few.flat[: held.size // 300] = 65535  # hot cells are no saturation
+        del file[f"exchange/{name}"]
+        file[f"exchange/{name}"] = few
+    open_scan(exchange)
+    full = np.minimum(65535, held.astype(np.float64) * 65535.0 / np.quantile(held, 0.9))
+    rewritten(exchange, f"exchange/{name}", full.astype(np.uint16))
+    said = "air" if name == "data_white" else "readings"
+    with pytest.warns(UserWarning, match=rf"% of {said} are 65535, the most that uint16 holds"):
+        open_scan(exchange)
+
+
+@pytest.mark.parametrize(
+    ("write", "name"),
+    [
+        (data_exchange, "measurement/instrument/detector/pixel_size"),
+        (nexus, "entry/instrument/detector/x_pixel_size"),
+    ],
+)
+def test_pixels_of_several_sizes_are_of_none(tmp_path, write, name):
+    path = write(tmp_path / "a.h5", DATA, WHITE, GEOMETRY.angles, DARK, 500.0)
+    for sizes, known in (([20.0, 20.0], True), ([20.0, np.nan], False), ([20.0, 40.0], False)):
+        rewritten(path, name, np.array(sizes), "um")
+        assert (open_scan(path).unit == "pixel^-1") is not known
+    with pytest.raises(ValueError, match="the size of its pixels is unknown: give pitch=, too"):
+        open_scan(path, mu_water=0.02)
+
+
 def test_what_a_file_lacks_is_asked_for_and_given(exchange, tmp_path):
     with h5py.File(exchange, "a") as file:
         del file["exchange/theta"], file["exchange/data_white"], file["exchange/data_dark"]

@@ -96,6 +96,38 @@ def test_nikon_images_that_do_not_count_on(tmp_path):
     assert open_scan(path).geometry.views == 24
 
 
+LISTED = {
+    "part.ang": "Proj\tAngle(deg)\r\n" + "{0:d}:\t{1:.4f}\r\n",
+    "_ctdata.txt": "Projs Frames Exposure\r\n24 1 500\r\nProj Angle Time\r\n"
+    + "{0:d} {1:.4f} {2:.2f}\r\n",
+}
+"""Lists of angles beside a scan: head, and a line that is written for every view."""
+
+
+@pytest.mark.parametrize("name", LISTED)
+def test_nikon_with_a_list_of_angles(tmp_path, name):
+    path = xtekct(tmp_path / "part", np.full(NIKON.shape, 0.5 * WHITE), NIKON, WHITE)
+    head, line = LISTED[name][: LISTED[name].index("{")], LISTED[name][LISTED[name].index("{") :]
+    even = 15.0 * np.arange(24)
+
+    def written(degrees):
+        lines = [line.format(k + 1, d, 0.5 * k) for k, d in enumerate(degrees)]
+        (path.parent / name).write_text(head + "".join(lines), encoding="utf-8")
+
+    rng = np.random.default_rng(0)
+    for sound in (even, -even, 90.0 - even, even % 360.0 - 180.0, even + rng.normal(0, 0.2, 24)):
+        written(sound)
+        assert open_scan(path).geometry == open_scan(path, gain=1.0).geometry
+    written(np.where(np.arange(24) > 9, even + 30.0, even))  # two views were left out
+    with pytest.warns(UserWarning, match=rf"{name} lists angles that do not go on by AngularStep"):
+        assert open_scan(path).geometry.views == 24
+    given = open_scan(path, angles_deg=(even + 30.0).tolist()).geometry
+    np.testing.assert_allclose(given.angles, NIKON.angles, atol=1e-12)
+    written(even[:20])
+    with pytest.raises(ValueError, match=rf"{name} lists 20 angles of 24 Projections"):
+        open_scan(path)
+
+
 def test_nikon_in_an_encoding_of_windows(tmp_path):
     readings = np.full(NIKON.shape, 0.5 * WHITE)
     path = xtekct(tmp_path / "part", readings, NIKON, WHITE)
@@ -124,6 +156,17 @@ def test_zeiss(tmp_path):
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 2])
     with pytest.raises(ValueError, match=r"a\.txrm cannot be read as a Zeiss scan"):
+        open_scan(path)
+
+
+def test_zeiss_at_one_distance(tmp_path):
+    readings, air = np.full(ZEISS.shape, 0.5 * WHITE), np.full((4, 48), WHITE)
+    stopped = np.where(np.arange(24) < 20, -300.0, 0.0).astype("<f4")
+    path = txrm(tmp_path / "a.txrm", readings, ZEISS, air, StoRADistance=stopped)
+    assert open_scan(path).geometry.sod == 300.0
+    moved = np.where(np.arange(24) < 12, -300.0, -310.0).astype("<f4")
+    path = txrm(tmp_path / "b.txrm", readings, ZEISS, air, StoRADistance=moved)
+    with pytest.raises(ValueError, match="is 300 mm of image 1 and 310 mm of image 13: the axis"):
         open_scan(path)
 
 
