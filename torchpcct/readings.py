@@ -175,6 +175,11 @@ def _views(cells: Tensor, geometry: Geometry) -> Tensor:
     return cells.unsqueeze(-len(geometry.shape))
 
 
+def _of_views(flux: Tensor, geometry: Geometry) -> Tensor:
+    """What all cells of a view share, ``(views,)``, with axes of cells."""
+    return flux.reshape(-1, *(1,) * (len(geometry.shape) - 1))
+
+
 def _dead(mask: object, readings: Tensor, air: Tensor, geometry: Geometry) -> Tensor:
     """Dead readings, ``readings.shape`` or the shape of one frame with an axis of views of
     length 1."""
@@ -360,6 +365,7 @@ def logged(
     lines: object,
     geometry: Geometry,
     photons: object,
+    flux: object,
     dead: object,
     linearisation: object,
     mu_water: float | None,
@@ -377,8 +383,11 @@ def logged(
             "are they counts, percentages or HU? Use from_counts for readings"
         )
     estimated = photons is None
+    current = None if flux is None else _flux(flux, geometry)
+    # Along the rays, with what the source sends more or less in each view.
+    bright = p if current is None else p - _of_views(current, geometry).log()
     air = (
-        torch.tensor(_photons(p, mask, geometry))
+        torch.tensor(_photons(bright, mask, geometry))
         if photons is None
         else _frame("photons", photons, cells)[0]
     )
@@ -386,8 +395,8 @@ def logged(
     if not bool(((air > 0) & torch.isfinite(air)).all()):
         raise ValueError("photons must be finite and greater than 0 in every cell")
     correction, unit = _correction(linearisation, geometry, mu_water)
-    return {
-        "counts": torch.exp(-p).mul_(_views(air, geometry)),
+    fields: ScanFields = {
+        "counts": torch.exp(-bright).mul_(_views(air, geometry)),
         "air": air,
         "linearisation": correction,
         "unit": unit,
@@ -398,6 +407,9 @@ def logged(
             "photons": f"estimated, {float(air.flatten()[0]):.3g}" if estimated else "given",
         },
     }
+    if current is not None:
+        fields["flux"] = current
+    return fields
 
 
 _HIGHEST = 40.0

@@ -203,6 +203,7 @@ class Scan:
         geometry: Geometry,
         *,
         photons: object = None,
+        flux: object = None,
         dead: object = None,
         linearisation: object = None,
         mu_water: float | None = None,
@@ -216,6 +217,8 @@ class Scan:
             geometry: as for :meth:`from_counts`.
             photons: of an unattenuated reading, one number or one per cell; it sets the statistical
                 weights. None: estimated from the noise between neighbouring columns.
+            flux: ``(views,)`` intensity of the source relative to ``photons`` (tube current
+                modulation), for the weights; None: the same in all views.
             dead, linearisation, mu_water, exposure_s, info: of :meth:`from_counts`.
 
         Raises:
@@ -223,7 +226,7 @@ class Scan:
                 range.
             TypeError: values of the wrong kind.
         """
-        fields = logged(lines, geometry, photons, dead, linearisation, mu_water)
+        fields = logged(lines, geometry, photons, flux, dead, linearisation, mu_water)
         fields["info"] |= dict(info or {})
         fields |= {"geometry": geometry, "exposure_s": exposure_s}
         return cls(**fields)

@@ -15,8 +15,10 @@ import datetime
 import importlib.util
 import json
 import os
+import pickle
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -369,10 +371,12 @@ def serve(name: str, case: Case) -> None:
 class Process:
     """A toolkit at work on a case; ``operations`` is empty where it is not installed."""
 
-    def __init__(self, python: str, name: str, number: int, small: bool) -> None:
-        call = [python, __file__, "--worker", name, "--case", str(number)]
+    def __init__(self, python: str, name: str, case: Path) -> None:
         self._process = subprocess.Popen(
-            call + ["--small"] * small, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [python, __file__, "--worker", name, "--case", str(case)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
         )
         self.operations: list[str] = self._answer() or []
 
@@ -398,10 +402,10 @@ class Process:
 
 
 def measure(
-    python: str, names: list[str], number: int, label: str, small: bool, rounds: int
+    python: str, names: list[str], label: str, case: Path, rounds: int
 ) -> list[dict[str, Any]]:
-    """One row for each toolkit and operation."""
-    processes = {name: Process(python, name, number, small) for name in names}
+    """One row for each toolkit and operation; ``case`` is the file of the case ``label``."""
+    processes = {name: Process(python, name, case) for name in names}
     rows = []
     for name, process in processes.items():
         errors = process.ask("errors") if process.operations else {}
@@ -410,7 +414,7 @@ def measure(
             rows.append({**row, "error": (errors or {}).get(operation)})
     # The errors' calls have warmed some operations up: the first call is that of a new process.
     for row in rows:
-        fresh = Process(python, row["toolkit"], number, small)
+        fresh = Process(python, row["toolkit"], case)
         answer = fresh.ask(row["operation"])
         fresh.close()
         if answer is None:
@@ -477,18 +481,22 @@ def main() -> None:
     parser.add_argument("--toolkits", nargs="+", choices=list(TOOLKITS), default=list(TOOLKITS))
     parser.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES))
     parser.add_argument("--worker", help=argparse.SUPPRESS)
-    parser.add_argument("--case", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--case", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
-    cases = bench_cases(options.small)
     if options.worker:
-        serve(options.worker, cases[options.case]())
+        serve(options.worker, pickle.loads(options.case.read_bytes()))
         return
+    cases = bench_cases(options.small)
     kept = options.out / "peers.json"
     rows: list[dict[str, Any]] = json.loads(kept.read_text()) if kept.exists() else []
     for number in map(CASES.index, options.cases):
-        label = cases[number]().name
-        names = options.toolkits
-        found = measure(options.python, names, number, label, options.small, options.rounds)
+        case = cases[number]()
+        label = case.name
+        with tempfile.TemporaryDirectory() as folder:
+            # Exact integrals of a cone beam take longer than what is measured: once for all.
+            file = Path(folder) / "case.pickle"
+            file.write_bytes(pickle.dumps(case))
+            found = measure(options.python, options.toolkits, label, file, options.rounds)
         now = datetime.datetime.now(datetime.UTC)
         run = (
             f"{options.rounds} rounds, {_machine()}, {now:%Y-%m-%d %H:%M} UTC, load "

@@ -26,12 +26,19 @@ def data_exchange(path: Path, data, white, angles, dark=None, pixel_um=None, **s
 
 
 def ct_pd(
-    folder: Path, lines, geometry, climb: float = 0.0, spot: str = "FFSNONE", shifts=None
+    folder: Path,
+    lines,
+    geometry,
+    climb: float = 0.0,
+    spot: str = "FFSNONE",
+    shifts=None,
+    photons=None,
 ) -> Path:
     """A folder of DICOM-CT-PD: focal spot at (−ρ sin φ, ρ cos φ), element i at φ + (i − i₀)Δ / d;
     water 0.02 mm⁻¹.
 
     ``shifts``: deflections (angle in rad, height and radius in mm) that the views have in turn.
+    ``photons``: of unattenuated readings, ``(views, columns)``.
     """
     import pydicom
     from pydicom.dataset import FileMetaDataset
@@ -72,6 +79,8 @@ def ct_pd(
                 (0x7033100B, 0x7033100C, 0x7033100D), shifts[k % len(shifts)], strict=True
             ):
                 d.add_new(tag, "FL", value)
+        if photons is not None:
+            d.add_new(0x70331065, "FL", photons[k][::-1].tolist())
         d.PixelData = np.rint((view[:, ::-1].T + 0.1) / 0.0001).astype("<u2").tobytes()
         # names in the other order
         d.save_as(folder / f"{len(lines) - k:04d}.dcm", enforce_file_format=True)

@@ -141,14 +141,23 @@ def test_weights_are_inverse_variances_and_do_not_follow_the_noise():
     assert abs(float((w * p).sum() / w.sum()) - truth) < 0.15 / mean + 4 * error
 
 
-def test_photons_are_estimated_from_noise():
-    p = torch.linspace(0, 3, 64) + torch.zeros(GEOMETRIES["fan"].views, 1)
-    noisy = -torch.log(
-        torch.poisson(2e4 * torch.exp(-p), generator=torch.Generator().manual_seed(0)) / 2e4
-    )
-    scan = Scan.from_line_integrals(noisy, GEOMETRIES["fan"])
+@pytest.mark.parametrize("modulated", [False, True])
+def test_photons_are_estimated_from_noise(modulated):
+    g = GEOMETRIES["fan"]
+    flux = 1.0 + 0.8 * torch.from_numpy(np.cos(2 * g.angles)).float()[:, None] * modulated
+    p = torch.linspace(0, 3, 64) + torch.zeros(g.views, 1)
+    counts = torch.poisson(
+        2e4 * flux * torch.exp(-p), generator=torch.Generator().manual_seed(0)
+    ).clamp_min(1.0)
+    noisy = -torch.log(counts / (2e4 * flux))
+    scan = Scan.from_line_integrals(noisy, g, flux=flux[:, 0] if modulated else None)
     assert float(scan.air[0]) == pytest.approx(2e4, rel=0.1)
     assert scan.info["photons"].startswith("estimated")
+    np.testing.assert_allclose(scan.line_integrals(), noisy, atol=1e-5)
+    given = Scan.from_line_integrals(noisy, g, photons=2e4, flux=flux[:, 0])
+    np.testing.assert_allclose(given.counts, counts, rtol=1e-4)
+    with pytest.raises(ValueError, match=r"flux must have one number per view, \(\d+,\), got"):
+        Scan.from_line_integrals(noisy, g, flux=np.ones(3))
 
 
 def test_a_polynomial_linearises():

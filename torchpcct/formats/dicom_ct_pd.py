@@ -56,6 +56,8 @@ _TAGS = {
 """Private tags of DICOM-CT-PD (Chen et al. 2015, Med. Phys. 42:6964)."""
 _SAME_SPOT = (2e-5, 0.01, 0.01)
 """Differences of deflections (rad, mm, mm) that are those of one position."""
+_SAME_FLUX = 1e-4
+"""Relative differences between views of which the source sends as much in all."""
 _TURN_MM = 0.05
 """Travel of the table from which a scan is a helix."""
 
@@ -69,7 +71,9 @@ class ClinicalProjections(NamedTuple):
         motion: ``(views, 3)`` z, y, x mm: the table's travel as a displacement of the grid, for
             ``Projector``; None of a scan at rest.
         mu_water: mm⁻¹, or None.
-        photons: of an unattenuated reading of every column, or None.
+        photons: of an unattenuated reading of every column, mean over the views, or None.
+        flux: ``(views,)`` intensity of the source relative to that (tube current modulation), or
+            None.
         info: provenance.
     """
 
@@ -78,6 +82,7 @@ class ClinicalProjections(NamedTuple):
     motion: NDArray[np.float64] | None
     mu_water: float | None
     photons: NDArray[np.float64] | None
+    flux: NDArray[np.float64] | None
     info: dict[str, object]
 
     def scan(self) -> Scan:
@@ -93,7 +98,12 @@ class ClinicalProjections(NamedTuple):
             )
         photons = None if self.photons is None else np.tile(self.photons, (self.geometry.rows, 1))
         return Scan.from_line_integrals(
-            self.lines, self.geometry, photons=photons, mu_water=self.mu_water, info=self.info
+            self.lines,
+            self.geometry,
+            photons=photons,
+            flux=self.flux,
+            mu_water=self.mu_water,
+            info=self.info,
         )
 
 
@@ -173,10 +183,18 @@ def read_dicom_ct_pd(
                 float(_value(file, f"shift_{k}", np.zeros(1))[0])
                 for k in ("angle", "height", "radius")
             )
-            views.append(
-                _View(int(file.InstanceNumber), angle, height, radius, shift, _pixels(file, first))
-            )
             photons = np.asarray(_value(file, "photons", np.zeros(0)), dtype=np.float64)
+            views.append(
+                _View(
+                    int(file.InstanceNumber),
+                    angle,
+                    height,
+                    radius,
+                    shift,
+                    _pixels(file, first),
+                    photons[::-1],
+                )
+            )
     views.sort(key=lambda v: v.number)
     _check_complete(folder, np.array([v.number for v in views]))
     assert first is not None  # dicom_files gives at least one
@@ -219,15 +237,12 @@ def read_dicom_ct_pd(
             zip(("angle_rad", "height_mm", "radius_mm"), shift, strict=True)
         )
     lines = torch.from_numpy(np.stack([v.lines for v in views]))
-    use = photons if photons.size == g.columns and (photons > 0).all() else None
-    return ClinicalProjections(
-        lines, geometry, motion, water, None if use is None else use[::-1].copy(), info
-    )
+    return ClinicalProjections(lines, geometry, motion, water, *_photons(views, g.columns), info)
 
 
 class _View(NamedTuple):
-    """A projection: the instance's number, the focal spot at rest, its deflection, and the line
-    integrals."""
+    """A projection: the instance's number, the focal spot at rest, its deflection, the line
+    integrals, and the photons of unattenuated readings of the columns, which may be none."""
 
     number: int
     angle: float
@@ -235,6 +250,20 @@ class _View(NamedTuple):
     radius: float
     shift: tuple[float, ...]
     lines: Floats32
+    photons: NDArray[np.float64]
+
+
+def _photons(
+    views: list[_View], columns: int
+) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
+    """Photons of unattenuated readings of the columns, and the flux of the views; None where not
+    all views have a table, or it is the same in all."""
+    if any(v.photons.size != columns or not (v.photons > 0).all() for v in views):
+        return None, None
+    tables = np.stack([v.photons for v in views])
+    flux = tables.mean(1) / tables.mean()
+    of_columns = (tables / flux[:, None]).mean(0)
+    return of_columns, flux if np.ptp(flux) > _SAME_FLUX else None
 
 
 def _check_complete(folder: str | os.PathLike[str], numbers: Ints) -> None:

@@ -55,7 +55,7 @@ class _Reader(NamedTuple):
 
 _COUNTS = {"gain", "flux", "dead", "electronic_noise", "linearisation", "exposure_s"}
 """Options of readers of counts."""
-_LINES = {"dead", "linearisation", "exposure_s"}
+_LINES = {"flux", "dead", "linearisation", "exposure_s"}
 """Of readers of line integrals."""
 _FRAMES = {"air", "dark"}
 """Frames that may be given in place of the file's."""

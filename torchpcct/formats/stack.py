@@ -35,6 +35,8 @@ dark: dark.npy              # optional, of counts without beam; as air
                             # several air frames)
 # electronic_noise: 2.0     # optional, of counts: standard deviation in photons
 # photons: 20000            # optional, of line_integrals: of an unattenuated reading
+# flux: flux.txt            # optional: intensity of the source in each view, relative to air or
+                            # photons
 # mu_water: 0.02            # optional: attenuation of water in 1/mm, for HU
 # linearisation: [1.0, 0.02]  # optional: beam hardening, c1 p + c2 p^2 + …
 geometry:
@@ -63,7 +65,7 @@ _COUNTS = {
     "exposure_s",
 }
 """Fields of a description of counts."""
-_LINES = {"photons", "dead", "linearisation", "mu_water", "exposure_s"}
+_LINES = {"photons", "flux", "dead", "linearisation", "mu_water", "exposure_s"}
 """Of line integrals."""
 _FILES = {"air", "dark", "dead", "flux", "photons"}
 """Fields that may name a file."""

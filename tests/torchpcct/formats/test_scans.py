@@ -366,6 +366,25 @@ def test_dicom_ct_pd(tmp_path):
         read_dicom_ct_pd(folder)
 
 
+def test_dicom_ct_pd_with_a_modulated_tube_current(tmp_path):
+    lines = line_integrals(CURVED, BODY, sub=1)
+    flux = 1.0 + 0.5 * np.cos(2 * CURVED.angles)
+    columns = 1e4 * (1.0 + np.arange(CURVED.columns) / CURVED.columns)
+    photons = flux[:, None] * columns
+    scan = open_scan(ct_pd(tmp_path / "modulated", lines, CURVED, photons=photons))
+    np.testing.assert_allclose(scan.flux.numpy(), flux / flux.mean(), rtol=1e-5)
+    expected = photons[:, None] * np.exp(-lines)
+    np.testing.assert_allclose(scan.counts.numpy(), expected, rtol=1e-3)
+    np.testing.assert_allclose(scan.line_integrals().numpy(), lines, atol=1e-4)
+    steady = open_scan(ct_pd(tmp_path / "steady", lines, CURVED, photons=0 * photons + columns))
+    assert steady.flux is None
+    np.testing.assert_allclose(steady.air.numpy(), np.tile(columns, (CURVED.rows, 1)), rtol=1e-6)
+    photons[3, 5] = 0.0  # no table
+    few = open_scan(ct_pd(tmp_path / "few", lines, CURVED, photons=photons))
+    assert few.flux is None
+    assert few.info["photons"].startswith("estimated")
+
+
 def test_helical_and_flying_spots_are_refused(tmp_path):
     part = CURVED.select(slice(0, 8))
     lines = line_integrals(part, BODY, sub=1)
