@@ -8,6 +8,7 @@ field, 3 invalid.
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -46,6 +47,11 @@ _DEEPEST = 5
 """Groups between the file and its detector."""
 _SAME_TIME = 1e-3
 """Relative difference of exposures that are the same."""
+_CURRENT = ("a", "ma", "ampere", "milliampere")
+"""Units of a ring's current, which is no sum over an exposure."""
+_MOST_FLUX = 2.0
+"""Factor by which a monitor may change between frames: beyond it, it has measured something else
+than the beam, or the beam was lost."""
 
 
 def _detectors(group: h5py.Group, depth: int = 0) -> Iterator[h5py.Group]:
@@ -113,7 +119,9 @@ def read_nexus(
     """A parallel-beam scan of an NXtomo file, the mean of its flat and of its dark frames as air
     and dark.
 
-    Flats that were taken with another ``count_time`` than the projections count by the ratio.
+    Flats that were taken with another ``count_time`` than the projections count by the ratio. What
+    a monitor of the beam read during each frame (``control/data``: counts, or the ring's current)
+    is the flux of the views relative to the flats.
 
     Args:
         path: HDF5 file.
@@ -171,6 +179,8 @@ def read_nexus(
             source = f"given, {pitch} mm"
         elif size is not None:
             pitch, source = length_in(size)
+        if options.get("flux") is None:
+            options["flux"] = _flux(file, detector, key)
         part = None if slices is None else [*slices.indices(data.shape[1])[:2], data.shape[1]]
         return Frames(
             str(path),
@@ -238,17 +248,65 @@ def _taken(data: h5py.Dataset, which: Bools, rows: slice) -> Any:
     return np.concatenate([data[run[0] : run[-1] + 1, rows] for run in runs])
 
 
-def _as_long(file: h5py.File, detector: str, key: Ints, white: Any, black: Any) -> Any:
-    """Flat frames as they would read if they had been exposed as long as the projections."""
+def _times(file: h5py.File, detector: str, key: Ints) -> tuple[float, float] | None:
+    """Exposures of projections and of flats, None where the file does not know both."""
     given = inside(file, f"{detector}/count_time")
     times = np.zeros(0) if given is None else np.ravel(given[()]).astype(np.float64)
-    if times.size != key.size:
-        return white
+    if times.size != key.size or not (key == _FLAT).any():
+        return None
     view, flat = (float(np.median(times[key == kind])) for kind in (_PROJECTION, _FLAT))
-    if not (view > 0 and flat > 0) or abs(view / flat - 1) < _SAME_TIME:
+    return (view, flat) if view > 0 and flat > 0 else None
+
+
+def _as_long(file: h5py.File, detector: str, key: Ints, white: Any, black: Any) -> Any:
+    """Flat frames as they would read if they had been exposed as long as the projections."""
+    times = _times(file, detector, key)
+    if times is None or abs(times[0] / times[1] - 1) < _SAME_TIME:
         return white
     below = black if np.ndim(black) < 3 else np.mean(black, axis=0)
-    return below + (white.mean(0) - below) * (view / flat)
+    return below + (white.mean(0) - below) * (times[0] / times[1])
+
+
+def _flux(file: h5py.File, detector: str, key: Ints) -> Floats | None:
+    """Intensity of the beam in each projection relative to the flats, or to the mean of the
+    projections where there are none; None: no monitor has measured it."""
+    import h5py
+
+    try:
+        held = [inside(file, f"{entry}/control/data") for entry in _entries(detector)]
+    except ValueError as error:  # in another file
+        return _left_out(str(error))
+    data = next((d for d in held if isinstance(d, h5py.Dataset)), None)
+    if data is None or data.size != key.size or data.dtype.kind not in "iuf":
+        return None
+    read = np.ravel(data[()]).astype(np.float64)
+    used = read[(key == _PROJECTION) | (key == _FLAT)]
+    if not used.any():
+        return None  # no monitor was there
+    where = f"{data.name} (the beam's monitor)"
+    if not (np.isfinite(used).all() and (used > 0).all() and used.max() < _MOST_FLUX * used.min()):
+        return _left_out(f"{where} changes from {used.min():g} to {used.max():g}")
+    times = _times(file, detector, key)
+    current = unit_text(data.attrs.get("units", "")) in _CURRENT
+    if not current and times is not None and abs(times[0] / times[1] - 1) >= _SAME_TIME:
+        return _left_out(f"{where} may hold sums over exposures, which differ, or none")
+    flats = read[key == _FLAT]
+    return read[key == _PROJECTION] / (flats if flats.size else read[key == _PROJECTION]).mean()
+
+
+def _left_out(why: str) -> None:
+    warnings.warn(
+        f"{why}: it is left out; give flux=, the intensity in each view relative to the flats, if "
+        "the beam has changed",
+        UserWarning,
+        stacklevel=4,
+    )
+
+
+def _entries(detector: str) -> list[str]:
+    """Groups around the detector's, from the nearest on."""
+    above = detector.split("/")[1:-1]
+    return ["/" + "/".join(above[:n]) for n in range(len(above), 0, -1)]
 
 
 def _angles(file: h5py.File, detector: str, key: Ints, given: object) -> Floats:
@@ -256,8 +314,7 @@ def _angles(file: h5py.File, detector: str, key: Ints, given: object) -> Floats:
     views = int((key == _PROJECTION).sum())
     if given is not None:
         return angles_of(given, views=views)
-    above = detector.split("/")[1:-1]
-    entries = ["/" + "/".join(above[:n]) for n in range(len(above), 0, -1)]
+    entries = _entries(detector)
     for name in (
         f"{entry}/{part}/rotation_angle" for entry in entries for part in ("sample", "data")
     ):

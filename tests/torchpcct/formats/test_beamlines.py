@@ -241,6 +241,55 @@ def test_image_keys_that_nexus_does_not_know_are_refused(tmp_path, wrong):
         open_scan(path)
 
 
+DECAY = np.linspace(1.05, 0.85, 60)
+"""Of the beam during the projections, relative to the flats."""
+
+
+def decayed(path, monitor, **more):
+    """The scan of :data:`DATA` in a beam that loses a fifth meanwhile, as a monitor saw it."""
+    data = np.rint((DATA - 100) * DECAY[:, None, None]) + 100
+    nexus(path, data, WHITE, GEOMETRY.angles, DARK, 500.0, **more)
+    with h5py.File(path, "a") as file:
+        key = file["entry/instrument/detector/image_key"][()]
+        read = np.full(key.size, 200.0)
+        read[key == 2] = 0.0  # dark: the beam is shut off
+        read[key == 0] *= DECAY
+        file["entry/control/data"] = monitor(read)
+    return path
+
+
+def test_what_a_monitor_of_the_beam_has_read_is_the_flux(tmp_path):
+    scan = open_scan(decayed(tmp_path / "a.nxs", lambda read: read))
+    np.testing.assert_allclose(scan.flux.numpy(), DECAY, rtol=1e-6)
+    close(scan)
+    close(open_scan(tmp_path / "a.nxs", slices=slice(1, 3)), slice(1, 3))
+    given = open_scan(tmp_path / "a.nxs", flux=2 * DECAY)
+    np.testing.assert_allclose(given.flux.numpy(), 2 * DECAY, rtol=1e-6)
+    for k, none in enumerate((lambda read: 0 * read, lambda read: read[:5])):
+        assert open_scan(decayed(tmp_path / f"{k}.nxs", none)).flux is None
+
+
+def test_the_current_of_a_ring_is_no_sum_over_an_exposure(tmp_path):
+    path = decayed(tmp_path / "a.nxs", lambda read: read, times=(0.4, 0.2))
+    with h5py.File(path, "a") as file:
+        file["entry/control/data"].attrs["units"] = "mA"
+    np.testing.assert_allclose(open_scan(path).flux.numpy(), DECAY, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("monitor", "times", "said"),
+    [
+        (lambda read: np.where(np.arange(read.size) == 20, 3.0, read), None, "changes from 3 to"),
+        (lambda read: np.where(np.arange(read.size) == 20, np.nan, read), None, "changes from nan"),
+        (lambda read: read, (0.4, 0.2), "may hold sums over exposures, which differ, or none"),
+    ],
+)
+def test_a_monitor_that_cannot_be_the_flux_is_left_out(tmp_path, monitor, times, said):
+    path = decayed(tmp_path / "a.nxs", monitor, times=times)
+    with pytest.warns(UserWarning, match=rf"control/data \(the beam's monitor\) {said}.*flux="):
+        assert open_scan(path).flux is None
+
+
 def test_images_of_alignment_of_a_nexus_file_are_no_views(tmp_path):
     # taken after the scan, as if the object had moved by then
     data = np.concatenate([DATA, np.roll(DATA[:3], 9, -1)])
