@@ -275,7 +275,8 @@ def _flux(file: h5py.File, detector: str, key: Ints) -> Floats | None:
     try:
         held = [inside(file, f"{entry}/control/data") for entry in _entries(detector)]
     except ValueError as error:  # in another file
-        return _left_out(str(error))
+        _leave_out(str(error))
+        return None
     data = next((d for d in held if isinstance(d, h5py.Dataset)), None)
     if data is None or data.size != key.size or data.dtype.kind not in "iuf":
         return None
@@ -285,16 +286,18 @@ def _flux(file: h5py.File, detector: str, key: Ints) -> Floats | None:
         return None  # no monitor was there
     where = f"{data.name} (the beam's monitor)"
     if not (np.isfinite(used).all() and (used > 0).all() and used.max() < _MOST_FLUX * used.min()):
-        return _left_out(f"{where} changes from {used.min():g} to {used.max():g}")
+        _leave_out(f"{where} changes from {used.min():g} to {used.max():g}")
+        return None
     times = _times(file, detector, key)
     current = unit_text(data.attrs.get("units", "")) in _CURRENT
     if not current and times is not None and abs(times[0] / times[1] - 1) >= _SAME_TIME:
-        return _left_out(f"{where} may hold sums over exposures, which differ, or none")
+        _leave_out(f"{where} may hold sums over exposures, which differ, or none")
+        return None
     flats = read[key == _FLAT]
     return read[key == _PROJECTION] / (flats if flats.size else read[key == _PROJECTION]).mean()
 
 
-def _left_out(why: str) -> None:
+def _leave_out(why: str) -> None:
     warnings.warn(
         f"{why}: it is left out; give flux=, the intensity in each view relative to the flats, if "
         "the beam has changed",
