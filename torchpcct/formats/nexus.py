@@ -17,7 +17,7 @@ import numpy as np
 from torchpcct.formats.damage import check_expansion, check_size, reading
 from torchpcct.formats.data_exchange import Frames, angles_in, given_frames, length_in
 from torchpcct.formats.geometry_yaml import angles_of
-from torchpcct.formats.lengths import unit_text
+from torchpcct.formats.lengths import MM, unit_text
 from torchpcct.hdf5 import inside
 from torchpcct.scan import Scan
 from torchpcct.validate import choice
@@ -181,6 +181,7 @@ def read_nexus(
             pitch, source = length_in(size)
         if options.get("flux") is None:
             options["flux"] = _flux(file, detector, key)
+        _check_rest(file, detector, key, pitch)
         part = None if slices is None else [*slices.indices(data.shape[1])[:2], data.shape[1]]
         return Frames(
             str(path),
@@ -270,14 +271,7 @@ def _as_long(file: h5py.File, detector: str, key: Ints, white: Any, black: Any) 
 def _flux(file: h5py.File, detector: str, key: Ints) -> Floats | None:
     """Intensity of the beam in each projection relative to the flats, or to the mean of the
     projections where there are none; None: no monitor has measured it."""
-    import h5py
-
-    try:
-        held = [inside(file, f"{entry}/control/data") for entry in _entries(detector)]
-    except ValueError as error:  # in another file
-        _leave_out(str(error))
-        return None
-    data = next((d for d in held if isinstance(d, h5py.Dataset)), None)
+    data = _held(file, detector, "control/data")
     if data is None or data.size != key.size or data.dtype.kind not in "iuf":
         return None
     read = np.ravel(data[()]).astype(np.float64)
@@ -286,24 +280,52 @@ def _flux(file: h5py.File, detector: str, key: Ints) -> Floats | None:
         return None  # no monitor was there
     where = f"{data.name} (the beam's monitor)"
     if not (np.isfinite(used).all() and (used > 0).all() and used.max() < _MOST_FLUX * used.min()):
-        _leave_out(f"{where} changes from {used.min():g} to {used.max():g}")
+        _leave_out(f"{where} changes from {used.min():g} to {used.max():g}, give flux= for it")
         return None
     times = _times(file, detector, key)
     current = unit_text(data.attrs.get("units", "")) in _CURRENT
     if not current and times is not None and abs(times[0] / times[1] - 1) >= _SAME_TIME:
-        _leave_out(f"{where} may hold sums over exposures, which differ, or none")
+        _leave_out(f"{where} may hold sums over exposures, which differ, give flux= for it")
         return None
     flats = read[key == _FLAT]
     return read[key == _PROJECTION] / (flats if flats.size else read[key == _PROJECTION]).mean()
 
 
+def _check_rest(file: h5py.File, detector: str, key: Ints, pitch: float | None) -> None:
+    """Warn of an object that was moved by half a cell or more during the projections."""
+    for name in ("x_translation", "y_translation", "z_translation"):
+        data = _held(file, detector, f"sample/{name}")
+        unit = None if data is None else MM.get(unit_text(data.attrs.get("units", "m")))
+        if data is None or unit is None or pitch is None or data.size != key.size:
+            continue
+        moved = unit * float(np.ptp(np.ravel(data[()])[key == _PROJECTION].astype(np.float64)))
+        if moved > 0.5 * pitch:
+            warnings.warn(
+                f"{data.name} changes by {moved:.3g} mm during the projections: the object was "
+                "moved (a helix, a stitched or a shaken scan), which is left out; give a "
+                "VectorGeometry for it",
+                UserWarning,
+                stacklevel=3,
+            )
+
+
 def _leave_out(why: str) -> None:
-    warnings.warn(
-        f"{why}: it is left out; give flux=, the intensity in each view relative to the flats, if "
-        "the beam has changed",
-        UserWarning,
-        stacklevel=4,
-    )
+    warnings.warn(f"{why}: it is left out", UserWarning, stacklevel=5)
+
+
+def _held(file: h5py.File, detector: str, name: str) -> h5py.Dataset | None:
+    """The data set of a name in the nearest group around the detector's that has one."""
+    import h5py
+
+    for entry in _entries(detector):
+        try:
+            found = inside(file, f"{entry}/{name}")
+        except ValueError as error:  # in another file
+            _leave_out(str(error))
+            return None
+        if isinstance(found, h5py.Dataset):
+            return found
+    return None
 
 
 def _entries(detector: str) -> list[str]:

@@ -50,6 +50,8 @@ _NEEDED = (
 """Entries that an .xtekct file must have."""
 _STRAIGHT_DEG = 1e-3
 """Tilt of the object's axis that does not matter."""
+_PLACED = 0.1
+"""Offset of the detector that does not matter, in cells."""
 _UNEVEN = 0.5
 """Steps of the turn by which listed angles may differ from even ones, as a table's do that is
 read out while it turns."""
@@ -117,6 +119,18 @@ def read_xtekct(
                 warnings.warn(
                     f"{path}: the rotation axis is inclined ({name} {degrees:.3g}°), which is left "
                     "out: give a VectorGeometry for it",
+                    UserWarning,
+                    stacklevel=2,
+                )
+        for axis, cell in (
+            ("X", values["DetectorPixelSizeX"]),
+            ("Y", values["DetectorPixelSizeY"]),
+        ):
+            shift = _optional(about, f"DetectorOffset{axis}")
+            if abs(shift) > _PLACED * cell:
+                warnings.warn(
+                    f"{path}: DetectorOffset{axis} {shift:g} mm is left out, as programs differ in "
+                    "its direction: find the rotation axis (find_axis, --find-axis), or calibrate",
                     UserWarning,
                     stacklevel=2,
                 )

@@ -1,5 +1,7 @@
 """Files of beamlines: Data Exchange and NeXus, written by h5py alone."""
 
+import warnings
+
 import h5py
 import numpy as np
 import pytest
@@ -269,6 +271,14 @@ def test_what_a_monitor_of_the_beam_has_read_is_the_flux(tmp_path):
         assert open_scan(decayed(tmp_path / f"{k}.nxs", none)).flux is None
 
 
+def test_a_monitor_in_another_file_is_left_out(tmp_path):
+    path = nexus(tmp_path / "a.nxs", DATA, WHITE, GEOMETRY.angles, DARK, 500.0)
+    with h5py.File(path, "a") as file:
+        file["entry/control/data"] = h5py.ExternalLink("b.nxs", "/data")
+    with pytest.warns(UserWarning, match="is a link to another file, b.nxs.*: it is left out"):
+        close(open_scan(path))
+
+
 def test_the_current_of_a_ring_is_no_sum_over_an_exposure(tmp_path):
     path = decayed(tmp_path / "a.nxs", lambda read: read, times=(0.4, 0.2))
     with h5py.File(path, "a") as file:
@@ -281,13 +291,31 @@ def test_the_current_of_a_ring_is_no_sum_over_an_exposure(tmp_path):
     [
         (lambda read: np.where(np.arange(read.size) == 20, 3.0, read), None, "changes from 3 to"),
         (lambda read: np.where(np.arange(read.size) == 20, np.nan, read), None, "changes from nan"),
-        (lambda read: read, (0.4, 0.2), "may hold sums over exposures, which differ, or none"),
+        (lambda read: read, (0.4, 0.2), "may hold sums over exposures, which differ, give"),
     ],
 )
 def test_a_monitor_that_cannot_be_the_flux_is_left_out(tmp_path, monitor, times, said):
     path = decayed(tmp_path / "a.nxs", monitor, times=times)
-    with pytest.warns(UserWarning, match=rf"control/data \(the beam's monitor\) {said}.*flux="):
+    with pytest.warns(
+        UserWarning, match=rf"control/data \(the beam's monitor\) {said}.*flux= for it: it is left"
+    ):
         assert open_scan(path).flux is None
+
+
+@pytest.mark.parametrize(("moved_um", "said"), [(0.0, False), (100.0, False), (900.0, True)])
+def test_an_object_that_was_moved_during_a_nexus_scan(tmp_path, moved_um, said):
+    path = nexus(tmp_path / "a.nxs", DATA, WHITE, GEOMETRY.angles, DARK, 500.0)
+    with h5py.File(path, "a") as file:
+        key = file["entry/instrument/detector/image_key"][()]
+        at = np.full(key.size, 9000.0)  # beside the beam, of flats
+        at[key == 0] = np.linspace(0.0, moved_um, 60)
+        file["entry/sample/z_translation"] = at
+        file["entry/sample/z_translation"].attrs["units"] = "um"
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        close(open_scan(path))
+    moved = "z_translation changes by 0.9 mm during the projections: the object was moved"
+    assert any(moved in str(w.message) for w in found) is said
 
 
 def test_images_of_alignment_of_a_nexus_file_are_no_views(tmp_path):

@@ -64,6 +64,9 @@ def test_nikon_with_another_axis_and_without_a_value(tmp_path):
     path.write_text(text.replace("ObjectOffsetX=0.48", "ObjectTilt=0.7"), encoding="utf-8")
     with pytest.warns(UserWarning, match=r"rotation axis is inclined \(ObjectTilt 0\.7°\)"):
         open_scan(path)
+    path.write_text(text.replace("Projections", "DetectorOffsetY=2\nProjections"), encoding="utf-8")
+    with pytest.warns(UserWarning, match=r"DetectorOffsetY 2 mm is left out, as programs differ"):
+        open_scan(path)
     path.write_text(text.replace("SrcToObject=300.0", "SrcToObject="), encoding="utf-8")
     with pytest.raises(ValueError, match="it has no SrcToObject"):
         open_scan(path)
