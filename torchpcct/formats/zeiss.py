@@ -8,6 +8,7 @@ source turns clockwise.
 from __future__ import annotations
 
 import os
+import warnings
 from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     import olefile
     from numpy.typing import ArrayLike
 
-    from torchpcct.typing import Array, CountsOptions
+    from torchpcct.typing import Array, CountsOptions, Floats
 
 
 __all__ = ["read_txrm"]
@@ -40,6 +41,8 @@ _STILL = 1e-3
 """Shift of an image, in cells, that is none."""
 _SAME_PLACE = 1e-3
 """Relative difference of distances that are the same."""
+_SAME_TIME = 1e-2
+"""Of exposures."""
 
 
 def read_txrm(
@@ -80,6 +83,8 @@ def read_txrm(
         kind = _type(held.numbers("ImageInfo/DataType", "<u4")[0])
         check_expansion((count, height, width), "the scan", os.stat(path).st_size)
         geometry = _geometry(held, count, height, width)
+        if options.get("flux") is None:
+            _check_exposures(held, count, path)
         rows = slice(None)
         info: dict[str, object] = {"file": str(path), "format": "Zeiss"}
         if slices is not None:
@@ -136,12 +141,16 @@ class _Streams:
             raise ValueError(f"its {name} holds {len(content) // size} of {count} numbers")
         return np.frombuffer(content, kind, count)
 
-    def distance(self, name: str, count: int) -> float:
-        """A distance in mm of all images, which may stand there for each of them."""
-        first = self.numbers(name, "<f4")[0]
+    def of_images(self, name: str, count: int) -> Floats:
+        """What stands there once, or for each image; of a scan that was stopped the rest may be
+        0."""
         size = self.file.get_size(name) // np.dtype("<f4").itemsize
-        each = np.abs(self.numbers(name, "<f4", min(size, count)).astype(np.float64))
-        # Of a scan that was stopped the rest may be 0.
+        return self.numbers(name, "<f4", max(1, min(size, count))).astype(np.float64)
+
+    def distance(self, name: str, count: int) -> float:
+        """A distance in mm of all images."""
+        first = self.numbers(name, "<f4")[0]
+        each = np.abs(self.of_images(name, count))
         other = np.flatnonzero((np.abs(each - each[0]) > _SAME_PLACE * each[0]) & (each != 0))
         if other.size:
             raise ValueError(
@@ -153,6 +162,23 @@ class _Streams:
 
     def image(self, name: str, kind: str, height: int, width: int) -> Array:
         return self.numbers(name, kind, height * width).reshape(height, width)
+
+
+def _check_exposures(held: _Streams, count: int, path: str | os.PathLike[str]) -> None:
+    """Warn of exposures that differ between images."""
+    name = "ImageInfo/ExpTimes"
+    if not held.file.exists(name):
+        return
+    times = held.of_images(name, count)
+    times = times[times > 0]
+    if times.size and np.ptp(times) > _SAME_TIME * times.mean():
+        warnings.warn(
+            f"{path}: the exposures of its images reach from {times.min():g} to {times.max():g} s, "
+            "and are taken for equal: give flux=, the exposure of each view over that of the "
+            "reference, unless the readings were divided by it",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def _geometry(held: _Streams, count: int, height: int, width: int) -> Geometry:

@@ -173,6 +173,21 @@ def test_zeiss_at_one_distance(tmp_path):
         open_scan(path)
 
 
+def test_zeiss_with_exposures_that_differ(tmp_path):
+    readings, air = np.full(ZEISS.shape, 0.5 * WHITE), np.full((4, 48), WHITE)
+    for k, times in enumerate(
+        (np.full(24, 2.0), np.full(1, 2.0), np.r_[np.full(20, 2.0), 4 * [0]])
+    ):
+        path = txrm(tmp_path / f"{k}.txrm", readings, ZEISS, air, ExpTimes=times.astype("<f4"))
+        assert open_scan(path).geometry.views == 24
+    times = np.where(np.arange(24) < 6, 4.0, 2.0).astype("<f4")
+    path = txrm(tmp_path / "a.txrm", readings, ZEISS, air, ExpTimes=times)
+    with pytest.warns(UserWarning, match="exposures of its images reach from 2 to 4 s, and are"):
+        open_scan(path)
+    given = open_scan(path, flux=times / 2).line_integrals()
+    np.testing.assert_allclose(given[0] - given[-1], np.log(2.0), atol=1e-4)
+
+
 def test_zeiss_with_images_that_were_shifted_and_without_a_reference(tmp_path):
     lines, shifts = (
         line_integrals(ZEISS, BODY, sub=1),
