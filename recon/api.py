@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar, Unpack, overload
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,12 +23,12 @@ from recon.result import Result, tested
 from torchpcct.checks.defects import dead_readings, repair_defects
 from torchpcct.checks.readings import reading_warnings
 from torchpcct.devices import device_of, same_device
-from torchpcct.geometry import VolumeGrid
+from torchpcct.geometry import Geometry, VolumeGrid
 from torchpcct.scan import Scan
 from torchpcct.scan_grid import finite_cells
 from torchpcct.scan_memory import once
 from torchpcct.validate import checked
-from torchpcct.vector_geometry import check_motion
+from torchpcct.vector_geometry import VectorGeometry, check_motion
 from torchpcct.volume import Volume, from_hu
 
 if TYPE_CHECKING:
@@ -44,6 +46,8 @@ _LOG = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
+_ONE_DIRECTION = 1e-9
+"""Views closer than this, over the unit circle or the source's distance, look from one place."""
 _STARVED = 0.5
 """More zero counts than this, and the logarithm no longer describes the data: FBP and PWLS would be
 guesswork."""
@@ -90,6 +94,26 @@ def require_light(zero_fraction: float) -> None:
         raise ValueError(
             f"{100 * zero_fraction:.0f} % of the readings are zero: too few photons for a "
             "line-integral method; raise the exposure or bin the readings"
+        )
+
+
+def require_directions(geometry: Geometry) -> None:
+    """Refuse a scan all of whose views look from one direction (ValueError): they are one picture,
+    of which iterative methods would make a volume of streaks without a word."""
+    rays = geometry.poses[:, 0] if isinstance(geometry, VectorGeometry) else None
+    if rays is None:
+        period = math.pi if geometry.parallel else 2.0 * math.pi
+        turns = np.exp((2j * math.pi / period) * geometry.angles)
+        spread = float(np.abs(turns - turns[0]).max())
+    else:
+        if geometry.parallel:
+            rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        spread = float(np.abs(rays - rays[0]).max()) / float(np.abs(rays).max())
+    if spread <= _ONE_DIRECTION:
+        count = f"all {geometry.views} views look" if geometry.views > 1 else "one view looks"
+        raise ValueError(
+            f"{count} from one direction, from which no volume follows: give the angle of every "
+            "view (a step of 0 or of a whole turn puts all at one)"
         )
 
 
@@ -182,9 +206,10 @@ def reconstruct(
 
     Raises:
         ValueError: an unknown method, kernel or option value, a grid outside the field of view, a
-            starved scan; a device that does not exist, has too little memory, or has no kernels for
-            the scan; scans or a ``problem`` on another device; a motion of another shape, beside a
-            ``problem``, or of a scan whose motion cannot be found.
+            starved scan, one whose views all look from one direction; a device that does not
+            exist, has too little memory, or has no kernels for the scan; scans or a ``problem`` on
+            another device; a motion of another shape, beside a ``problem``, or of a scan whose
+            motion cannot be found.
         TypeError: ``scan`` is no :class:`torchpcct.Scan`, or an option does not exist.
 
     Example:
@@ -212,6 +237,8 @@ def reconstruct(
     there = _device(scans, device)
     for s in scans:
         require_light(s.zero_fraction)
+        if motion is None:
+            require_directions(s.geometry)
     name, named = split_method(method)
     twice = sorted(named.keys() & options.keys())
     if twice:

@@ -37,9 +37,13 @@ from torchpcct.scene.materials import MATERIALS, Material
 
 NAN = math.nan
 INF = math.inf
-NO_NUMBER = ("a", None, 1j, [1.0], {}, object())
+NO_NUMBER = ("a", None, 1j, [1.0], {}, object(), True, np.True_)
 LENGTH = (*NO_NUMBER, NAN, INF, -INF, 0.0, -1.0)
 PLACE = (*NO_NUMBER, NAN, INF, -INF)
+NO_SCAN = (1e-300, 1e300)
+"""Lengths that no scan has."""
+AFAR = (1e30, -1e30, 1e300)
+"""Places that no detector has."""
 COUNT = ("a", None, 1j, [1], {}, NAN, INF, 1.5, 0, -1, True, "3")
 LEVEL = (*NO_NUMBER, NAN, -0.5, 0.0, 1.0, 2.0, 95)
 CHOICE = ("round", None, 3, "", ["flat"])
@@ -62,24 +66,30 @@ ANGLES = (
     [1 + 2j, 0.3],
     [None, 1.0],
     [[0.1], [0.2, 0.3]],
+    [0.0, 1e30],
 )
 
 TABLE = [
     (
         ParallelBeam,
         PARALLEL,
-        {"angles": ANGLES, "columns": COUNT, "pitch": LENGTH, "offset": PLACE},
+        {
+            "angles": ANGLES,
+            "columns": (*COUNT, 10**12),
+            "pitch": (*LENGTH, *NO_SCAN),
+            "offset": (*PLACE, *AFAR),
+        },
     ),
     (
         FanBeam,
         FAN,
         {
             "angles": ANGLES,
-            "sod": LENGTH,
-            "sdd": (*LENGTH, 400.0),
-            "columns": COUNT,
-            "pitch": LENGTH,
-            "offset": PLACE,
+            "sod": (*LENGTH, *NO_SCAN),
+            "sdd": (*LENGTH, 400.0, *NO_SCAN),
+            "columns": (*COUNT, 10**12),
+            "pitch": (*LENGTH, *NO_SCAN, 1e5),
+            "offset": (*PLACE, *AFAR, 1e5),
             "detector": CHOICE,
         },
     ),
@@ -88,12 +98,20 @@ TABLE = [
         CONE,
         {
             "angles": ANGLES,
-            "sod": LENGTH,
-            "sdd": (*LENGTH, 400.0),
-            "columns": COUNT,
-            "rows": COUNT,
-            "pitch": (*LENGTH, (1.0, 0.0), (1.0, NAN), (1.0, 1.0, 1.0)),
-            "offset": (*PLACE, (0.0, NAN), (0.0, 0.0, 0.0)),
+            "sod": (*LENGTH, *NO_SCAN),
+            "sdd": (*LENGTH, 400.0, *NO_SCAN),
+            "columns": (*COUNT, 10**12),
+            "rows": (*COUNT, 10**12),
+            "pitch": (
+                *LENGTH,
+                (1.0, 0.0),
+                (1.0, NAN),
+                (1.0, 1.0, 1.0),
+                *NO_SCAN,
+                (1e-300, 1.0),
+                (1e5, 1.0),
+            ),
+            "offset": (*PLACE, (0.0, NAN), (0.0, 0.0, 0.0), *AFAR, (1e30, 0.0), (1e5, 0.0)),
             "detector": CHOICE,
         },
     ),

@@ -28,6 +28,7 @@ from torchpcct.validate import checked, choice, number, per_axis, whole
 
 if TYPE_CHECKING:
     from torchpcct.typing import Views
+    from torchpcct.validate import Limits
 
     class _HasGrid(Protocol):
         """A scan that knows the grid of what it sees."""
@@ -46,6 +47,22 @@ _DEGREES_SPAN_RAD = 20.0
 _DEGREES_STEP_RAD = 0.04
 """Together with steps of so many rad and more (2.3°): 20 and more degrees, up to 9000 views a turn,
 taken as rad. Helical scans of as many turns have far smaller steps."""
+
+
+_LENGTHS: Limits = {"positive": True, "low": 1e-9, "high": 1e12, "unit": "mm"}
+"""Limits of lengths: a cell narrower than 1e-9 mm is below the wavelength of X-rays, also where
+somebody counts in metres, and a source 1e12 mm away is farther than the moon is."""
+_MOST_CELLS = 10**7
+"""Columns and rows at most: as many cells of a µm make a detector of 10 m."""
+_MOST_OFFSET = 1e7
+"""Cells between the detector's middle and the beam's axis at most: beyond, single precision no
+longer tells one cell from the next. Detectors of one cell that are moved sideways need 1e5."""
+_STEEPEST_RAD = math.radians(85.0)
+"""Largest angle between a ray and the line from the source through the axis, on a flat detector:
+beyond, less than a thousandth of the light is left and a ray crosses eleven cells in a depth of
+one. Pitches in µm and distances in cm are found by it."""
+_FARTHEST_RAD = 1e9
+"""Angles at most: of larger ones double precision loses a thousandth of the step between views."""
 
 
 @checked
@@ -84,6 +101,13 @@ def _angles(value: object) -> Floats:
         raise ValueError(
             f"angles must be finite, but view {int(np.argmin(np.isfinite(angles)))} is not"
         )
+    far = np.abs(angles) > _FARTHEST_RAD
+    if far.any():
+        view = int(np.argmax(far))
+        raise ValueError(
+            f"angles must lie within ±{_FARTHEST_RAD:g} rad, got {angles[view]:g} at view {view}: "
+            "round-off would turn such views at random; give them modulo 2π"
+        )
     if np.ptp(angles) > _DEGREES_SPAN_RAD and view_step(angles) > _DEGREES_STEP_RAD:
         warnings.warn(
             f"the angles cover {np.ptp(angles) / (2 * math.pi):.0f} turns in steps of "
@@ -94,6 +118,21 @@ def _angles(value: object) -> Floats:
         )
     angles.setflags(write=False)
     return angles
+
+
+def cells(name: str, value: object) -> int:
+    """Number of a detector's columns or rows, as :func:`torchpcct.validate.whole` checks it."""
+    return whole(name, value, high=_MOST_CELLS)
+
+
+def _require_near(name: str, offset: float, pitch: float) -> None:
+    """Refuse (ValueError) a detector that is farther from the beam's axis than any is."""
+    if abs(offset) > _MOST_OFFSET * pitch:
+        raise ValueError(
+            f"{name} must be the position of the detector's middle in mm, at most "
+            f"{_MOST_OFFSET:g} cells from the beam's axis, got {offset:g} mm with cells of "
+            f"{pitch:g} mm"
+        )
 
 
 def view_step(angles: Floats) -> float:
@@ -273,7 +312,8 @@ class ParallelBeam(Geometry):
             4``).
 
     Raises:
-        ValueError: a count < 1, a length ≤ 0, a non-finite or empty value.
+        ValueError: a count < 1, a length ≤ 0, a non-finite or empty value, what no scan can have (a
+            pitch beyond 1e-9 … 1e12 mm, 1e7 cells, angles beyond 1e9 rad).
         TypeError: a value of the wrong kind.
     """
 
@@ -285,9 +325,10 @@ class ParallelBeam(Geometry):
     def __post_init__(self) -> None:
         set_ = object.__setattr__
         set_(self, "angles", _angles(self.angles))
-        set_(self, "columns", whole("columns", self.columns))
-        set_(self, "pitch", number("pitch", self.pitch, positive=True, unit="mm"))
+        set_(self, "columns", cells("columns", self.columns))
+        set_(self, "pitch", number("pitch", self.pitch, **_LENGTHS))
         set_(self, "offset", number("offset", self.offset, unit="mm"))
+        _require_near("offset", self.offset, self.pitch)
 
     @property
     def parallel(self) -> bool:
@@ -323,9 +364,9 @@ class _Divergent(Geometry):
     def _validate_divergent(self) -> None:
         set_ = object.__setattr__
         set_(self, "angles", _angles(self.angles))
-        set_(self, "sod", number("sod", self.sod, positive=True, unit="mm"))
-        set_(self, "sdd", number("sdd", self.sdd, positive=True, unit="mm"))
-        set_(self, "columns", whole("columns", self.columns))
+        set_(self, "sod", number("sod", self.sod, **_LENGTHS))
+        set_(self, "sdd", number("sdd", self.sdd, **_LENGTHS))
+        set_(self, "columns", cells("columns", self.columns))
         if self.sdd <= self.sod:
             raise ValueError(
                 f"sdd ({self.sdd} mm) must be greater than sod ({self.sod} mm): sdd is the "
@@ -342,6 +383,27 @@ class _Divergent(Geometry):
                     f"a curved detector of {self.columns} columns × {pitch} mm at sdd {self.sdd} "
                     f"mm spans a half-fan of {math.degrees(half):.1f}°, 90° or more: reduce "
                     "columns or pitch"
+                )
+
+    def _validate_place(self) -> None:
+        """Of a detector whose size is known: that its rays can meet it."""
+        _require_near("offset", self.column_offset, self.column_pitch)
+        sides = [(self.columns, self.column_pitch, self.column_offset, "columns")]
+        if self.has_rows:
+            _require_near("offset", self.row_offset, self.row_pitch)
+            sides.append((self.shape[1], self.row_pitch, self.row_offset, "rows"))
+        self._validate_arc()
+        for count, pitch, offset, name in sides:
+            if name == "columns" and self.detector == "curved":
+                continue
+            steepest = math.atan((count * pitch / 2 + abs(offset)) / self.sdd)
+            if steepest > _STEEPEST_RAD:
+                raise ValueError(
+                    f"a detector of {count} {name} × {pitch:g} mm, {offset:g} mm off the beam's "
+                    f"axis, at sdd {self.sdd:g} mm is met by rays at "
+                    f"{math.degrees(steepest):.2f}°, more than "
+                    f"{math.degrees(_STEEPEST_RAD):g}°: are {name}, pitch, offset and sdd in "
+                    "one unit, mm?"
                 )
 
     @property
@@ -388,7 +450,8 @@ class FanBeam(_Divergent):
 
     Raises:
         ValueError: a count < 1, a length ≤ 0, ``sdd <= sod``, an unknown detector, a half-fan of
-            90° or more.
+            90° or more (flat: 85°), what no scan can have (lengths beyond 1e-9 … 1e12 mm, 1e7
+            cells, angles beyond 1e9 rad).
         TypeError: a value of the wrong kind.
     """
 
@@ -402,9 +465,9 @@ class FanBeam(_Divergent):
 
     def __post_init__(self) -> None:
         self._validate_divergent()
-        object.__setattr__(self, "pitch", number("pitch", self.pitch, positive=True, unit="mm"))
+        object.__setattr__(self, "pitch", number("pitch", self.pitch, **_LENGTHS))
         object.__setattr__(self, "offset", number("offset", self.offset, unit="mm"))
-        self._validate_arc()
+        self._validate_place()
 
     @property
     def column_pitch(self) -> float:
@@ -431,7 +494,8 @@ class ConeBeam(_Divergent):
 
     Raises:
         ValueError: a count < 1, a length ≤ 0, ``sdd <= sod``, an unknown detector, a half-fan of
-            90° or more.
+            90° or more (flat: 85°), what no scan can have (lengths beyond 1e-9 … 1e12 mm, 1e7
+            cells, angles beyond 1e9 rad).
         TypeError: a value of the wrong kind.
     """
 
@@ -446,12 +510,10 @@ class ConeBeam(_Divergent):
 
     def __post_init__(self) -> None:
         self._validate_divergent()
-        object.__setattr__(self, "rows", whole("rows", self.rows))
-        object.__setattr__(
-            self, "pitch", per_axis("pitch", self.pitch, 2, positive=True, unit="mm")
-        )
+        object.__setattr__(self, "rows", cells("rows", self.rows))
+        object.__setattr__(self, "pitch", per_axis("pitch", self.pitch, 2, **_LENGTHS))
         object.__setattr__(self, "offset", per_axis("offset", self.offset, 2, unit="mm"))
-        self._validate_arc()
+        self._validate_place()
 
     @property
     def shape(self) -> tuple[int, ...]:

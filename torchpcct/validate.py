@@ -64,7 +64,8 @@ def number(
 
     Args:
         name: what the message calls it.
-        value: anything that ``float`` takes.
+        value: anything that ``float`` takes, texts of numbers too (YAML reads ``2e-3`` as one);
+            not True and False, which it would take for 1 and 0.
         positive: refuse 0 and less.
         finite: refuse infinities; NaN is always refused.
         low, high: closed range.
@@ -78,6 +79,8 @@ def number(
     if isinstance(value, complex):
         raise TypeError(f"{name} must be a real number{unit and ' in' + unit}, got {value!r}")
     try:
+        if _is_truth(value):
+            raise TypeError
         result = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
         raise TypeError(

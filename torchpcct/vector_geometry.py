@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, beam
-from torchpcct.validate import checked, number, whole
+from torchpcct.geometry import ConeBeam, FanBeam, Geometry, ParallelBeam, beam, cells
+from torchpcct.validate import checked, number, reals
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -29,6 +29,11 @@ if TYPE_CHECKING:
 __all__ = ["VectorGeometry", "helical_motion"]
 
 Floats = NDArray[np.float64]
+
+_FARTHEST_MM = 1e12
+"""Places at most: the moon is nearer."""
+_NARROWEST_MM = 1e-9
+"""Steps to the next cell at least: the wavelength of X-rays is longer, in metres, too."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -43,8 +48,9 @@ class VectorGeometry(Geometry):
         parallel: parallel rays; then the first entries are the rays' direction, of any length.
 
     Raises:
-        ValueError: a wrong shape, values that are not finite, rays of no direction, a detector
-            without area or that its rays meet edge on.
+        ValueError: a wrong shape, values that are not finite or beyond 1e12 mm, rays of no
+            direction, a detector without area, with cells narrower than 1e-9 mm, or that its rays
+            meet edge on.
         TypeError: a value of the wrong kind.
     """
 
@@ -55,7 +61,7 @@ class VectorGeometry(Geometry):
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
-        v = np.array(self.vectors, dtype=np.float64)
+        v = np.array(reals("vectors", self.vectors))
         width = 6 if self.rows is None else 12
         if v.ndim != 2 or v.shape[1] not in (6, 12) or not len(v):
             raise ValueError(f"vectors must have shape (views, 6) or (views, 12), got {v.shape}")
@@ -67,16 +73,31 @@ class VectorGeometry(Geometry):
         if not np.isfinite(v).all():
             view = int(np.argmin(np.isfinite(v).all(1)))
             raise ValueError(f"vectors must be finite, but those of view {view} are not")
+        far = np.abs(v) > _FARTHEST_MM
+        if far.any():
+            view = int(np.argmax(far.any(1)))
+            raise ValueError(
+                f"vectors must be places in mm, within ±{_FARTHEST_MM:g}, got "
+                f"{v[view][far[view]][0]:g} in view {view}"
+            )
         if not isinstance(self.parallel, bool):
             raise TypeError(f"parallel must be True or False, got {self.parallel!r}")
         v.setflags(write=False)
         set_(self, "vectors", v)
-        set_(self, "columns", whole("columns", self.columns))
-        set_(self, "rows", None if self.rows is None else whole("rows", self.rows))
+        set_(self, "columns", cells("columns", self.columns))
+        set_(self, "rows", None if self.rows is None else cells("rows", self.rows))
         ray, _, u, up = self.poses.transpose(1, 0, 2)
         if not self.parallel:
             ray = self.poses[:, 1] - ray
         sizes = [np.linalg.norm(x, axis=1) for x in (ray, u, up)]
+        least = np.minimum(np.abs(u).max(1), np.abs(up).max(1))  # squares of 1e-300 would be 0
+        narrow = (least > 0.0) & (least < _NARROWEST_MM)
+        if narrow.any():
+            view = int(narrow.argmax())
+            raise ValueError(
+                f"u and v must be the steps to the next column and row in mm, at least "
+                f"{_NARROWEST_MM:g}, got {least[view]:g} in view {view}"
+            )
         volume = np.abs((np.cross(u, up) * ray).sum(1))
         bad = volume <= 1e-9 * sizes[0] * sizes[1] * sizes[2]
         if bad.any():

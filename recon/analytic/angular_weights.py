@@ -60,12 +60,15 @@ def _lacking(angles: Floats, period: float) -> str:
     widest = np.sort(gaps)[::-1]
     inner = widest[1] if widest.size > 1 and widest[0] > OPEN_GAP_STEPS * usual else widest[0]
     if max(usual, min(inner, period)) > WIDEST_STEP_RAD + 1e-9 and inner <= OPEN_GAP_STEPS * usual:
+        remedy = (
+            'add views, or reconstruct by "pwls" or "mbir"'
+            if gaps.size > 1
+            else "are the angles those of the views?"
+        )
         raise ValueError(
             f"{gaps.size} distinct view{'s' * (gaps.size > 1)} in steps of up to "
-            f"{math.degrees(inner):.0f}° are too "
-            f"few for filtered backprojection (at most {math.degrees(WIDEST_STEP_RAD):.0f}°): add "
-            "views, or "
-            'reconstruct by "pwls" or "mbir"'
+            f"{math.degrees(inner):.0f}° are too few for filtered backprojection (at most "
+            f"{math.degrees(WIDEST_STEP_RAD):.0f}°): {remedy}"
         )
     if inner > OPEN_GAP_STEPS * usual:
         lacking = (

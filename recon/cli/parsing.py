@@ -205,7 +205,15 @@ def check_limits(arguments: argparse.Namespace, parser: Parser) -> None:
         given = getattr(arguments, name) or []
         for path in given if isinstance(given, list) else [given]:
             if not path.exists():
-                raise FileNotFoundError(f"no such file: {path}{_HINTS.get(name, '')}")
+                raise FileNotFoundError(f"no such file: {path}{hint_of_missing(name, path)}")
+
+
+def hint_of_missing(name: str, path: Path) -> str:
+    """Where a file that is not there may come from, by the argument's name; of a pattern, that the
+    shell was kept from replacing it, or found nothing."""
+    if any(character in str(path) for character in "*?["):
+        return " (the shell replaces a pattern: write it without quotes, or does no file match?)"
+    return _HINTS.get(name, "")
 
 
 def command(
@@ -276,6 +284,8 @@ def _in_brackets(deep: int) -> str:
     return r"[^()]*" if deep == 0 else rf"(?:[^()]|\({_in_brackets(deep - 1)}\))*"
 
 
+_OF_FILE = " cannot be read as "
+"""Before what is wrong within a file (:func:`torchpcct.formats.damage.reading`)."""
 _VALUES = re.compile(
     # VolumeGrid(shape=(8, 8), center=(0.0, 0.0)): what an object prints
     rf"[A-Za-z_][\w.]*\({_in_brackets(4)}\)"
@@ -307,7 +317,10 @@ def as_options(text: str, actions: Sequence[argparse.Action]) -> str:
         text = re.sub(rf"{name}=True{_ENDS}", flag, text)
         text = re.sub(rf"{name}=([\"']?)([+-]?[\w-]+(?:\.\d+)?)\1{_ENDS}", rf"{flag} \2", text)
         text = re.sub(rf"{name}={_ENDS}", f"{flag} {value}" if value else flag, text)
-        text = re.sub(rf"(^|: ){action.dest}(?=(\[\d\])? (must|needs)\b)", rf"\g<1>{flag}", text)
+        # What a file says of itself is no option, though it may be called like one.
+        said, of_file, rest = text.partition(_OF_FILE)
+        said = re.sub(rf"(^|: ){action.dest}(?=(\[\d\])? (must|needs)\b)", rf"\g<1>{flag}", said)
+        text = said + of_file + rest
     return re.sub("\0", lambda _: shown.pop(0), text)
 
 

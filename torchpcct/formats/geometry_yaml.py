@@ -80,6 +80,8 @@ _OPTIONAL = {"offset", "detector", "parallel", "origin"}
 """Fields with a default."""
 _TURNED = ("roll_deg", "tilt_deg", "slant_deg")
 """Fields of ``pose``: turns of the detector."""
+_FULL_TURN_DEG = 360.0
+"""Their largest value."""
 _SHIFTED = ("columns", "rows")
 """Shifts of the detector, mm."""
 _HELIX = ("feed", "start")
@@ -136,8 +138,15 @@ def _posed(circle: Any, pose: object, folder: Path) -> VectorGeometry:
         raise ValueError(
             f"geometry.pose must be a mapping of {', '.join(known)}, got {pose!r:.200}"
         )
-    numbers = {name: _table(f"pose.{name}", value, folder) for name, value in pose.items()}
-    helix = {name: numbers[name] for name in _HELIX if name in numbers}
+    given = {name: _table(f"pose.{name}", value, folder) for name, value in pose.items()}
+    helix = {name: given.pop(name) for name in _HELIX if name in given}
+    numbers = {name: reals(f"geometry.pose.{name}", value) for name, value in given.items()}
+    for name in _TURNED:
+        if name in numbers and not (np.abs(numbers[name]) <= _FULL_TURN_DEG).all():
+            raise ValueError(
+                f"geometry.pose.{name} must lie within ±{_FULL_TURN_DEG:g}°, got "
+                f"{numbers[name].flat[np.argmax(~(np.abs(numbers[name]) <= _FULL_TURN_DEG))]:g}"
+            )
     if "start" in helix and "feed" not in helix:
         raise ValueError("geometry.pose.start is the first height of a helix: give feed, too")
     found = VectorGeometry.of(circle, helical_motion(circle, **helix) if helix else None)
