@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Scan"]
 
+_LONGEST_S = 1e12
+"""Exposures at most: 30 000 years."""
 NOISE_FREE_EXPOSURE_S = 1.0
 """The exposure that the expected readings of a noise-free scan stand for."""
 _FOLLOWED = 1000.0
@@ -679,9 +681,10 @@ class Scan:
 
 @checked
 def check_exposure(exposure_s: float | None) -> None:
-    """Raise ``ValueError`` unless the exposure is a finite time > 0 s, or None (noise free)."""
+    """Raise ``ValueError`` unless the exposure is a time > 0 s that a scan can take, or None (noise
+    free)."""
     if exposure_s is not None:
-        number("exposure_s", exposure_s, positive=True, unit="s")
+        number("exposure_s", exposure_s, positive=True, high=_LONGEST_S, unit="s")
 
 
 def _check(scan: Scan) -> None:

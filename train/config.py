@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar
@@ -20,7 +20,7 @@ import yaml
 
 from recon.mbir.network import NetworkConfig
 from recon.names import is_module_name
-from torchpcct.formats.damage import yaml_values
+from torchpcct.formats.damage import read_yaml, yaml_values
 from torchpcct.validate import checked, number, numbers, whole
 from train.scenes.scene import SceneConfig
 
@@ -34,6 +34,14 @@ __all__ = ["DataConfig", "ObjectiveConfig", "TrainConfig", "load_config"]
 
 LONGEST_INTERVAL = 120.0
 """Largest ``checkpoint_seconds``: what a killed run may lose, in s."""
+_MOST = 10**9
+"""Steps, scenes and views at most: more are a slip of the pen."""
+_HIGHEST = {"seed": 2**62, "unroll": 1000}
+"""Other limits."""
+_MOST_VOXELS = 1024
+"""Voxels along an edge of the training inset at most."""
+_FASTEST = 10.0
+"""Learning rate of Adam at most, which moves every weight by so much in a step."""
 VALIDATED_AT_ONCE = 4
 """Scenes that a validation reconstructs at a time."""
 
@@ -42,6 +50,10 @@ def _set(config: object, **values: object) -> None:
     """Put checked values into a frozen dataclass."""
     for name, value in values.items():
         object.__setattr__(config, name, value)
+
+
+def _is_list(value: object) -> bool:
+    return isinstance(value, Sequence) and not isinstance(value, str)
 
 
 C = TypeVar("C", bound="DataclassInstance")
@@ -55,11 +67,18 @@ def _section(cls: type[C], values: object, where: str) -> C:
     if not isinstance(values, Mapping):
         raise ValueError(f"{label} must be a mapping of names to values, got {values!r}")
     known = [f.name for f in fields(cls)]
-    values = {"fidelities" if k == "looks" else k: v for k, v in values.items()}  # its former name
+    if "looks" in values and "fidelities" in known:  # its former name
+        if "fidelities" in values:
+            raise ValueError(f"{label}: looks is the former name of fidelities: leave one out")
+        values = {"fidelities" if k == "looks" else k: v for k, v in values.items()}
     for key in values:
         if key not in known:
             name = f"{where}.{key}" if where else str(key)
             raise ValueError(f"unknown key {name!r}; known in {label}: {', '.join(known)}")
+    needed = [f.name for f in fields(cls) if f.default is MISSING and f.default_factory is MISSING]
+    missing = [name for name in needed if name not in values]
+    if missing:
+        raise ValueError(f"{label}: needs {', '.join(map(repr, missing))}")
     try:
         return cls(**values)
     except (TypeError, ValueError) as error:
@@ -153,22 +172,35 @@ class DataConfig:
     flat_roi: float = 0.6
 
     def __post_init__(self) -> None:
-        if len(self.shape) != 3:
+        if not _is_list(self.shape) or len(self.shape) != 3:
             raise ValueError(f"shape must be 3 numbers (z, y, x), got {self.shape!r}")
         if not self.situations:
             raise ValueError("situations must name at least one scan")
+        if not _is_list(self.situations):
+            raise ValueError(
+                f"situations must be a list of places such as {{x: 42, y: 0}}, got "
+                f"{self.situations!r}"
+            )
         _section(SceneConfig, self.scenes, "scenes")
         _set(
             self,
-            shape=tuple(whole(f"shape[{i}]", n) for i, n in enumerate(self.shape)),
+            shape=tuple(
+                whole(f"shape[{i}]", n, high=_MOST_VOXELS) for i, n in enumerate(self.shape)
+            ),
             voxel_mm=number("voxel_mm", self.voxel_mm, positive=True),
-            views=whole("views", self.views),
+            views=whole("views", self.views, high=_MOST),
             situations=tuple(
                 _section(Situation, s, f"situations[{i}]") for i, s in enumerate(self.situations)
             ),
-            scenes_kept=whole("scenes_kept", self.scenes_kept),
+            scenes_kept=whole("scenes_kept", self.scenes_kept, high=_MOST),
             flat_roi=number("flat_roi", self.flat_roi, low=0.0, high=1.0),
         )
+        for i, place in enumerate(self.situations):
+            if math.hypot(place.x, place.y) >= place.patient_mm / 2.0:
+                raise ValueError(
+                    f"situations[{i}]: x and y must be in mm and within the patient, whose radius "
+                    f"is {place.patient_mm / 2.0:g} mm, got x {place.x:g}, y {place.y:g}"
+                )
         for name in ("exposure_s", "core_roi", "tissue_roi"):
             low, high = numbers(name, getattr(self, name), 2, positive=True)
             if low > high:
@@ -200,7 +232,7 @@ class LateConfig:
         _set(
             self,
             begins=number("begins", self.begins, low=0.0, high=1.0),
-            scenes_kept=whole("scenes_kept", self.scenes_kept),
+            scenes_kept=whole("scenes_kept", self.scenes_kept, high=_MOST),
         )
 
 
@@ -258,7 +290,7 @@ class ObjectiveConfig:
         if not 0 <= low <= high <= 1:
             raise ValueError(f"fidelities must be a range within 0 … 1, got {self.fidelities}")
         _set(self, fidelities=(low, high))
-        _set(self, held_out=whole("held_out", self.held_out, 2))
+        _set(self, held_out=whole("held_out", self.held_out, 2, _MOST))
 
 
 @dataclass(frozen=True)
@@ -330,10 +362,10 @@ class TrainConfig:
             "unroll": 1,
         }
         for name, least in lowest.items():
-            whole(name, getattr(self, name), least)
+            whole(name, getattr(self, name), least, _HIGHEST.get(name, _MOST))
         _set(
             self,
-            learning_rate=number("learning_rate", self.learning_rate, positive=True),
+            learning_rate=number("learning_rate", self.learning_rate, positive=True, high=_FASTEST),
             decay=number("decay", self.decay, low=0.0, high=1.0),
             final_fraction=number("final_fraction", self.final_fraction, low=0.0, high=1.0),
             clip=number("clip", self.clip, positive=True, finite=False),
@@ -396,7 +428,11 @@ class TrainConfig:
             ValueError: not a mapping of known keys to values of the right kind and range; the
                 message names the key.
         """
-        values = yaml_values(text)
+        return cls.of(yaml_values(text))
+
+    @classmethod
+    def of(cls, values: object) -> Self:
+        """The same of what YAML holds; None for nothing."""
         config: Self = _section(cls, {} if values is None else values, "")
         return config
 
@@ -419,8 +455,9 @@ def load_config(path: str | Path) -> TrainConfig:
         ValueError: as :meth:`TrainConfig.from_yaml`, with the file's name.
         OSError: the file cannot be read.
     """
+    values = read_yaml(path, "a configuration of a training")
     try:
-        return TrainConfig.from_yaml(Path(path).read_text(encoding="utf-8"))
+        return TrainConfig.of(values)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 

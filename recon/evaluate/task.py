@@ -35,9 +35,11 @@ from scipy import ndimage
 from torch import Tensor
 
 from recon.analytic.exact_noise import line_integral_variance
+from recon.evaluate.names import check_method
 from recon.jobs.sources import source_digest
 from recon.jobs.store import Store
 from recon.least_squares.beyond_grid import beyond_grid
+from recon.names import split_energies
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.acquisition.path_lengths import tissue_path_lengths
 from torchpcct.detector_window import DetectorWindow, footprint
@@ -69,6 +71,8 @@ _MOSTLY = 0.8
 """The same where there are too few of those."""
 _FEW = 4
 """Voxels that are too few."""
+_LONGEST_S = 1e6
+"""Exposures at most, eleven days."""
 _AROUND_MM = 1.5
 """The background is read as far from the signal, mm."""
 _SMALL_MM2 = 0.25
@@ -144,7 +148,8 @@ class Task:
 
     Raises:
         ValueError: no such bodies, a signal that does not touch the inset, voxels too large for it,
-            ROIs of another grid.
+            ROIs of another grid, a reference that is not FBP, an exposure that is given twice.
+        TypeError: a title or reference that is no text.
     """
 
     name: str
@@ -199,7 +204,17 @@ class Task:
                         f"{tuple(weights.shape)}, the inset {tuple(self.grid.shape)}: weights on "
                         "another grid come with it, rois={} takes those that follow from the scene"
                     )
-        exposures = tuple(numbers("exposures_s", self.exposures_s, positive=True, unit="s"))
+        for field_name in ("title", "reference"):
+            value = getattr(self, field_name)
+            if not isinstance(value, str):
+                raise TypeError(f"task {self.name}: {field_name} must be a text, got {value!r}")
+        check_method(self.reference)
+        if split_energies(self.reference)[0].partition(":")[0] != "fbp" or "@" in self.reference:
+            raise ValueError(
+                f"task {self.name}: reference must be FBP, fbp:KERNEL, that factors are quoted "
+                f"against, got {self.reference!r}"
+            )
+        exposures = exposures_of(self.exposures_s)
         for name, value in (
             ("signal", signal),
             ("background", background),
@@ -535,6 +550,19 @@ class SomeViews:
             self.scale * self.share * np.array([_inner(m, self.weight * self.lines) for m in maps])
         )
         return np.asarray(np.linalg.solve(information, right) - 1000.0)
+
+
+def exposures_of(value: object) -> tuple[float, ...]:
+    """Exposures in s, each once.
+
+    Raises:
+        TypeError, ValueError: no numbers, none, out of range, one that is given twice.
+    """
+    found = tuple(numbers("exposures_s", value, positive=True, high=_LONGEST_S, unit="s"))
+    twice = next((e for k, e in enumerate(found) if e in found[:k]), None)
+    if twice is not None:
+        raise ValueError(f"exposures_s has {twice:g} s twice: leave one out")
+    return found
 
 
 def contrast_bound(information: Floats) -> float:

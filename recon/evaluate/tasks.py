@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import torch
@@ -34,9 +34,6 @@ from torchpcct.scene.plaque.plaque import Plaque
 from torchpcct.scene.scene import Scene
 from torchpcct.validate import choice, number, numbers, whole
 from torchpcct.volume import Volume
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 __all__ = ["AnatomyTask", "VesselTask", "VoxelTask", "read_task"]
 
@@ -63,6 +60,10 @@ _KEYS = (
 """Of a task in YAML."""
 _VOXEL_MM = 0.2
 """What MBIR's network was trained on."""
+_LONGEST = 10_000
+"""Voxels along an edge of an inset at most: insets are small parts of what is scanned."""
+_FARTHEST_MM = 1e6
+"""Places of insets at most, from the axis."""
 _FEATURE = "feature"
 """The signal of an anatomy."""
 _FAT = "fat"
@@ -110,9 +111,15 @@ def _task(values: object, name: str, folder: Path) -> Task:
     unknown = [str(k) for k in values if k not in _KEYS]
     if unknown:
         raise ValueError(f"task {name}: unknown {', '.join(unknown)}; it takes {', '.join(_KEYS)}")
+    values = {key: value for key, value in values.items() if value is not None}
     for key in ("scene", "signal", "inset"):
         if key not in values:
             raise ValueError(f"task {name} needs {key}; see torchpcct show-task plaque")
+    for key in ("name", "title", "background", "reference"):
+        if not isinstance(values.get(key, ""), str) and (
+            key != "name" or not _is_whole(values[key])
+        ):
+            raise TypeError(f"task {name}: {key} must be a text, got {values[key]!r:.200}")
     name = (
         str(values["name"])
         if "name" in values
@@ -127,7 +134,13 @@ def _task(values: object, name: str, folder: Path) -> Task:
             f"task {name}: the scene must be made of bodies (kind plaque, thorax, water or bodies)"
         )
     signal = values["signal"]
-    signal = (signal,) if isinstance(signal, str) else tuple(signal)
+    signal = (signal,) if isinstance(signal, str) else signal
+    if not isinstance(signal, list | tuple) or not all(isinstance(each, str) for each in signal):
+        raise TypeError(
+            f"task {name}: signal must be the name of a body of the scene, or a list of names, got "
+            f"{signal!r:.200}"
+        )
+    signal = tuple(signal)
     if not signal:
         raise ValueError(f"task {name}: signal names no body of the scene")
     given: dict[str, Any] = {
@@ -159,6 +172,11 @@ def _task(values: object, name: str, folder: Path) -> Task:
     return replace(task, rois=_protocol(plaque_scene(**options)[1], grid))
 
 
+def _is_whole(value: object) -> bool:
+    """Whether YAML has read a name for a whole number, such as 7."""
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
 def _inset(name: str, value: object, scene: Scene, signal: tuple[str, ...]) -> VolumeGrid:
     """A grid as of ``region``; or of ``size`` mm about the signal, in voxels of ``voxel_mm``."""
     if not isinstance(value, Mapping) or "size" not in value:
@@ -169,16 +187,26 @@ def _inset(name: str, value: object, scene: Scene, signal: tuple[str, ...]) -> V
             f"{name}: unknown {', '.join(unknown)}; with size it takes voxel_mm and center"
         )
 
-    def triple(what: Mapping[str, float] | Sequence[float]) -> list[float]:
-        return [what[a] for a in "zyx"] if isinstance(what, Mapping) else list(what)
+    def triple(key: str, **limits: Any) -> tuple[float, ...]:
+        given = value[key]
+        if isinstance(given, Mapping):
+            if set(given) != set("zyx"):
+                raise ValueError(
+                    f"{name}.{key} must have z, y and x in mm, got {dict(given)!r:.200}"
+                )
+            given = [given[axis] for axis in "zyx"]
+        return tuple(numbers(f"{name}.{key}", given, 3, unit="mm", **limits))
 
-    size = numbers(f"{name}.size", triple(value["size"]), 3, positive=True, unit="mm")
+    size = triple("size", positive=True)
     voxel = number(f"{name}.voxel_mm", value.get("voxel_mm", _VOXEL_MM), positive=True, unit="mm")
+    if not voxel <= min(size) or max(size) > _LONGEST * voxel:
+        raise ValueError(
+            f"{name}: voxel_mm must make 1 to {_LONGEST} voxels of each edge, got {voxel:g} mm for "
+            f"edges of {' × '.join(f'{s:g}' for s in size)} mm"
+        )
     shape = tuple(int(np.ceil(s / voxel - 1e-6)) for s in size)
     if "center" in value:
-        return VolumeGrid(
-            shape, voxel, tuple(numbers(f"{name}.center", triple(value["center"]), 3))
-        )
+        return VolumeGrid(shape, voxel, triple("center", low=-_FARTHEST_MM, high=_FARTHEST_MM))
     if not signal:
         raise ValueError(f"{name} needs center {{z, y, x}} in mm: that is where the voxels are put")
     # About what the signal lies in, where that is small: a plaque's vessel, not a patient.

@@ -53,6 +53,8 @@ _LEAST = 1e-3
 """In noise units: what the gate takes for 0."""
 _BLOCK = 2
 """Edge in voxels of the blocks that become channels."""
+_MOST_CHANNELS = 2**14
+"""Channels of a level at most: two such levels have 7e9 weights."""
 _DEPTH = 3
 """Levels of resolution."""
 
@@ -83,9 +85,11 @@ class NetworkConfig:
     gate: bool = False
 
     def __post_init__(self) -> None:
-        if len(self.channels) != _DEPTH:
-            raise ValueError(f"channels must name {_DEPTH} levels, got {self.channels!r}")
-        object.__setattr__(self, "channels", tuple(whole("channels", c, 1) for c in self.channels))
+        given = self.channels
+        if not isinstance(given, list | tuple) or len(given) != _DEPTH:
+            raise ValueError(f"channels must name {_DEPTH} levels, got {given!r}")
+        channels = tuple(whole("channels", c, 1, _MOST_CHANNELS) for c in given)
+        object.__setattr__(self, "channels", channels)
         object.__setattr__(self, "voxel_mm", number("voxel_mm", self.voxel_mm, positive=True))
         object.__setattr__(self, "local_mm", number("local_mm", self.local_mm, low=0.0, unit="mm"))
         for name in ("turns", "bilateral", "gate"):

@@ -101,6 +101,10 @@ def test_the_example_configuration_is_complete(tmp_path, cli):
             "tolerance_hu must be a number in HU, got 'small'",
         ),
         ("scene: {kind: water}\ntolerance_hu: -1", "tolerance_hu must be"),
+        ("scene: {kind: water}\ntolerance_hu: true", "tolerance_hu must be a number in HU"),
+        ("scene: {kind: bodies, bodies: 5}", "scene.bodies must be a list of bodies, .* got 5"),
+        ("scene: {kind: bodies, bodies: {a: 1}}", "scene.bodies must be a list of bodies"),
+        ("scene: {kind: water}\nscanner: pcct", "scanner must be a mapping with preset .*'pcct'"),
     ],
 )
 def test_configurations_that_are_none_are_refused(tmp_path, text, expected_text):
@@ -345,6 +349,8 @@ def test_a_warning_is_said_once_and_in_the_words_of_the_command(capsys):
         == "--pitch 0.5 or --pitch x; pitch must be 1"
     )
     assert as_options("pitch must be 1", actions) == "--pitch must be 1"
+    of_file = "a.yaml cannot be read as a scan: pitch must be 1"
+    assert as_options(of_file, actions) == of_file
     assert (
         as_options("a: pitch[1] needs 1 (pitch=)", actions) == "a: --pitch[1] needs 1 (--pitch MM)"
     )

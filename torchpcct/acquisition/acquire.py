@@ -37,6 +37,8 @@ __all__ = ["acquire", "acquire_voxels"]
 
 _TOLERANCE = 1e-5
 """Error of a line integral over a metre of body by the number of basis maps."""
+_DENSEST_GAS = 0.02
+"""Density in g/cm³ up to which a material is a gas: radon has 0.01."""
 _SUB_COLUMNS = 2
 """Parts of a cell whose transmissions are averaged: a cell records the mean of the photons, not
 of the path lengths."""
@@ -121,7 +123,8 @@ def acquire(
         with the second moment of the transmitted spectrum in ``quantum``, exact for every reading.
 
     Raises:
-        ValueError: ``exposure_s`` ≤ 0, a bad seed, bodies outside ``region``, a region outside the
+        ValueError: ``exposure_s`` ≤ 0, a bad seed, a body that reaches the tube or the detector,
+            bodies outside ``region``, a region outside the
             field of view, a moving scene without ``rotation_s``, a ``duty`` outside (0, 1],
             ``tolerance_hu`` below 0 or NaN.
         TypeError: an argument of the wrong kind.
@@ -136,6 +139,7 @@ def acquire(
             )
         clean = acquire_voxels(scene, scanner, progress=progress)
         return clean if exposure_s is None else clean.with_noise(exposure_s, seed)
+    _require_outside(scene, scanner.geometry)
     start = time.perf_counter()
     turn_s = exposure_s if rotation_s is None else rotation_s
     key = readings_key(
@@ -177,6 +181,22 @@ def acquire(
     scan = detected(scanner, counts, air, energies, info, kept, plan_.kept)
     scan = scan if plan_.kept is None else replace(scan, region=region)
     return scan if exposure_s is None else scan.with_noise(exposure_s, seed)
+
+
+def _require_outside(scene: Scene, geometry: ConeBeam) -> None:
+    """Refuse (ValueError) a tube or a detector within a body: chords are those of whole lines, as
+    if both were outside. Gases may be all around."""
+    radial = np.stack(
+        [np.cos(geometry.angles), np.sin(geometry.angles), 0.0 * geometry.angles], axis=1
+    )
+    for what, distance in (("tube", geometry.sod), ("detector", geometry.sod - geometry.sdd)):
+        inside = scene.labels(distance * radial)
+        for k in np.unique(inside[inside >= 0]):
+            if scene.materials[k].density_g_cm3 > _DENSEST_GAS:
+                raise ValueError(
+                    f"the body {scene.names[k]!r} reaches the {what}, {abs(distance):g} mm from "
+                    "the axis: are scene and scanner in mm?"
+                )
 
 
 def readings_key(scene: Scene, scanner: Scanner, **options: object) -> str | None:

@@ -207,7 +207,12 @@ def _build(
 
 
 def _scanner(value: object, folder: Path) -> tuple[Scanner, dict[str, object]]:
-    given = dict(value) if isinstance(value, Mapping) else {}
+    if value is not None and not isinstance(value, Mapping):
+        raise TypeError(
+            "scanner must be a mapping with preset (pcct or eid), or with geometry, source and "
+            f"detector, got {value!r:.200}"
+        )
+    given = dict(value or {})
     if "geometry" in given:
         return scanner_of(given, folder), given
     preset = choice(
@@ -231,16 +236,13 @@ def _scene(value: object, folder: Path) -> tuple[Scene | VoxelScene, dict[str, o
         return _voxels(_mapping("scene", given, ("file", "energy_kev", "dense")), folder)
     if kind == "bodies":
         _mapping("scene", given, ("bodies",))
-        return Scene([_body(k, b) for k, b in enumerate(given.get("bodies") or [])]), {
-            "kind": kind,
-            **given,
-        }
+        return Scene(_bodies(given)), {"kind": kind, **given}
     from torchpcct.scene.phantoms.quality import water_cylinder  # load what is asked for only
     from torchpcct.scene.phantoms.thorax import thorax
     from torchpcct.scene.plaque import Plaque, plaque_scene
     from torchpcct.scene.plaque.variants import plaque_variant
 
-    more = [_body(k, b) for k, b in enumerate(given.get("bodies") or [])]
+    more = _bodies(given)
     own = {k: v for k, v in given.items() if k != "bodies"}
     if kind == "plaque":
         variant = own.pop("variant", "paper")
@@ -251,6 +253,17 @@ def _scene(value: object, folder: Path) -> tuple[Scene | VoxelScene, dict[str, o
         make = makers[kind]
         made = _build("scene", make, _mapping("scene", own, (*_parameters(make), "bodies")))
     return (made.add(*more) if more else made), {"kind": kind, **given}
+
+
+def _bodies(given: Mapping[str, Any]) -> list[Body]:
+    """Those of a scene, parents before their children."""
+    bodies = given.get("bodies") or []
+    if not isinstance(bodies, list | tuple):
+        raise TypeError(
+            f"scene.bodies must be a list of bodies, each on a line that begins with -, got "
+            f"{bodies!r:.200}"
+        )
+    return [_body(k, body) for k, body in enumerate(bodies)]
 
 
 def _body(k: int, value: object) -> Body:

@@ -35,7 +35,7 @@ from torchpcct.geometry import ConeBeam
 from torchpcct.scanner.detector import Scintillator, SiliconDetector
 from torchpcct.scanner.filters import Bowtie, large_bowtie
 from torchpcct.scanner.scanner import Scanner
-from torchpcct.scanner.source import Slabs, Source
+from torchpcct.scanner.source import THICKEST_MM, Slabs, Source
 from torchpcct.scene.materials import material
 from torchpcct.validate import choice, number, reals
 
@@ -68,8 +68,11 @@ def scanner_of(values: object, folder: Path = Path()) -> Scanner:
             "scanner.geometry must be of kind cone, without pose: scans are simulated on a circle; "
             f"got {type(geometry).__name__}"
         )
+    name = given.get("name")
+    if not isinstance(name, str | int | float | None) or isinstance(name, bool):
+        raise TypeError(f"scanner.name must be a text, got {name!r:.200}")
     return Scanner(
-        str(given.get("name", "own scanner")),
+        "own scanner" if name is None else str(name),
         geometry,
         _source(given.get("source", {}), folder),
         _detector(given["detector"]),
@@ -93,7 +96,7 @@ def _slabs(name: str, value: object) -> Slabs:
     if not isinstance(value, Mapping):
         raise TypeError(f"{name} must be a mapping such as {{aluminium: 2.5}} (mm), got {value!r}")
     return tuple(
-        (material(str(key)), number(f"{name}.{key}", mm, low=0.0, unit="mm"))
+        (material(str(key)), number(f"{name}.{key}", mm, low=0.0, high=THICKEST_MM, unit="mm"))
         for key, mm in value.items()
     )
 
@@ -124,7 +127,7 @@ def _detector(value: object) -> SiliconDetector | Scintillator:
         given["material"] = material(str(given["material"]))
     if "thresholds_kev" in given:
         thresholds = reals("scanner.detector.thresholds_kev", given["thresholds_kev"])
-        given["thresholds_kev"] = tuple(thresholds.tolist())
+        given["thresholds_kev"] = tuple(np.atleast_1d(thresholds).tolist())
     detector: SiliconDetector | Scintillator = made(**given)
     return detector
 

@@ -24,6 +24,8 @@ __all__ = ["Scanner"]
 
 Floats = NDArray[np.float64]
 
+_SIGMAS = 10.0
+"""Standard deviations of the recorded energy within which any photon is recorded."""
 PILE_UP_ORDER = 15
 """Coefficients per column of a water correction with pile-up, which bends the curve more."""
 
@@ -44,7 +46,7 @@ class Scanner:
 
     Raises:
         TypeError: a part of the wrong kind.
-        ValueError: a value outside its range.
+        ValueError: a value outside its range, thresholds above all energies.
     """
 
     name: str
@@ -65,6 +67,13 @@ class Scanner:
             if not isinstance(value, kind):
                 raise TypeError(
                     f"{field_name} must be a {kind.__name__}, got {type(value).__name__}"
+                )
+        if isinstance(self.detector, SiliconDetector):
+            lowest, blur = self.detector.thresholds_kev[0], self.detector.sigma_kev
+            if lowest > self.source.kvp + _SIGMAS * blur:
+                raise ValueError(
+                    f"thresholds_kev must begin below the tube's {self.source.kvp:g} kV, got "
+                    f"{lowest:g} keV: no photon would be counted"
                 )
         bowties = (self.bowties,) if isinstance(self.bowties, Bowtie) else tuple(self.bowties or ())
         if not all(isinstance(b, Bowtie) for b in bowties):

@@ -33,6 +33,13 @@ air agrees within 2 % with that computed from the 100 kVp, 7° spectrum table of
 CatSim/XCIST simulator, which the plaque study used: real anodes are rough and give less than the
 ideal one."""
 
+THICKEST_MM = 1e6
+"""Filters at most, mm: nothing passes a kilometre, not even of air."""
+_MOST = 1e9
+"""Current in mA and output at most: flash tubes have 1e7 mA."""
+_WIDEST_SPOT_MM = 100.0
+"""Focal spots at most: the largest sources, of cobalt, have 20 mm; of µm taken for mm they have
+hundreds."""
 _NEGLIGIBLE = 1e-6
 """Bins are dropped at both ends of the spectrum where together they hold less than this share of
 the photons."""
@@ -56,7 +63,7 @@ def slabs(name: str, value: Iterable[tuple[Material, float]]) -> Slabs:
             raise TypeError(
                 f"{name} must hold (Material, mm) pairs, got {m!r}: use material('aluminium')"
             )
-        number(f"{name}: thickness of {m.name}", t, low=0.0, unit="mm")
+        number(f"{name}: thickness of {m.name}", t, low=0.0, high=THICKEST_MM, unit="mm")
     return pairs
 
 
@@ -127,13 +134,18 @@ class Source:
             "anode_angle_deg",
             number("anode_angle_deg", self.anode_angle_deg, low=3.0, high=45.0, unit="°"),
         )
-        set_(self, "current_ma", number("current_ma", self.current_ma, positive=True, unit="mA"))
+        set_(
+            self,
+            "current_ma",
+            number("current_ma", self.current_ma, positive=True, high=_MOST, unit="mA"),
+        )
         set_(
             self,
             "output",
-            number("output", self.output, positive=True, unit="times spekpy's output"),
+            number("output", self.output, positive=True, high=_MOST, unit="times spekpy's output"),
         )
-        set_(self, "focal_spot", numbers("focal_spot", self.focal_spot, 2, low=0.0, unit="mm"))
+        spot = numbers("focal_spot", self.focal_spot, 2, low=0.0, high=_WIDEST_SPOT_MM, unit="mm")
+        set_(self, "focal_spot", spot)
         set_(self, "filtration", slabs("filtration", self.filtration))
         if self.table is not None:
             set_(self, "table", _table(self.table))

@@ -20,6 +20,8 @@ from torchpcct.validate import checked, number, numbers, reals
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from torchpcct.validate import Limits
+
 
 __all__ = ["Box", "Ellipsoid", "EllipticCylinder", "Shape", "rotation_matrix"]
 
@@ -29,6 +31,10 @@ Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[flo
 
 FAR = 2000.0
 """Where the surface of an infinite shape is sampled to, mm: far beyond any scanner."""
+_MOST_MM = 1e9
+"""Places and sizes at most, beyond any scanner; larger ones overflow on the way."""
+_SIZES: Limits = {"positive": True, "low": 1e-9, "high": _MOST_MM, "unit": "mm"}
+"""Limits of sizes: an atom is larger than the smallest."""
 _ORTHOGONAL = 1e-9
 """Deviation of m mᵀ from the identity up to which m is a rotation."""
 
@@ -106,7 +112,11 @@ class Shape:
     rotation: Any = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "position", numbers("position", self.position, 3))
+        object.__setattr__(
+            self,
+            "position",
+            numbers("position", self.position, 3, low=-_MOST_MM, high=_MOST_MM, unit="mm"),
+        )
         object.__setattr__(self, "rotation", _rotation(self.rotation))
 
     @property
@@ -197,7 +207,7 @@ class Ellipsoid(Shape):
     def __post_init__(self) -> None:
         super().__post_init__()
         axes = (self.semi_axes,) * 3 if np.ndim(self.semi_axes) == 0 else self.semi_axes
-        object.__setattr__(self, "semi_axes", numbers("semi_axes", axes, 3, positive=True))
+        object.__setattr__(self, "semi_axes", numbers("semi_axes", axes, 3, **_SIZES))
 
     @property
     def rotationally_symmetric(self) -> bool:
@@ -236,7 +246,7 @@ class EllipticCylinder(Shape):
     def __post_init__(self) -> None:
         super().__post_init__()
         axes = (self.semi_axes,) * 2 if np.ndim(self.semi_axes) == 0 else self.semi_axes
-        object.__setattr__(self, "semi_axes", numbers("semi_axes", axes, 2, positive=True))
+        object.__setattr__(self, "semi_axes", numbers("semi_axes", axes, 2, **_SIZES))
         object.__setattr__(
             self,
             "half_length",
@@ -288,7 +298,7 @@ class Box(Shape):
     def __post_init__(self) -> None:
         super().__post_init__()
         half = (self.half_lengths,) * 3 if np.ndim(self.half_lengths) == 0 else self.half_lengths
-        object.__setattr__(self, "half_lengths", numbers("half_lengths", half, 3, positive=True))
+        object.__setattr__(self, "half_lengths", numbers("half_lengths", half, 3, **_SIZES))
 
     @property
     def rotationally_symmetric(self) -> bool:

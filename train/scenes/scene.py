@@ -22,16 +22,25 @@ contrasts of 0.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchpcct.validate import number, numbers, whole
+
 __all__ = ["SceneConfig", "TrainingScene"]
 
 Range = tuple[float, float]
+"""Of HU or relative changes, which may be negative."""
+Amount: TypeAlias = Range
+"""Of what is at least 0."""
+Size: TypeAlias = Range
+"""Of sizes and ratios, many log-uniform, which are greater than 0."""
+Probability: TypeAlias = float
 Triple = tuple[float, float, float]
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 """Rows of the unit matrix."""
@@ -117,91 +126,124 @@ class SceneConfig:
         blur, motion: standard deviations of the focal spot's blur in the plane, and of motion in
             one direction of the plane, which motion_probability of the scenes have: what the data
             show is blurred, the truth is not.
+
+    Raises:
+        TypeError, ValueError: a value that is no probability, range or number of its kind.
     """
 
     fat: Range = (-105.0, -55.0)
     muscle: Range = (0.0, 70.0)
-    muscle_probability: float = 0.15
-    free_probability: float = 0.12
+    muscle_probability: Probability = 0.15
+    free_probability: Probability = 0.12
     free_count: tuple[int, int] = (2, 6)
     free_contrast: Range = (-150.0, 300.0)
-    free_size: Range = (0.3, 3.0)
-    wide_probability: float = 0.3
+    free_size: Size = (0.3, 3.0)
+    wide_probability: Probability = 0.3
     wide_contrast: Range = (-900.0, 1500.0)
-    beside_probability: float = 0.45
+    beside_probability: Probability = 0.45
     beside_distance: Range = (-0.3, 4.0)
-    beside_size: Range = (5.0, 40.0)
-    second_vessel: float = 0.3
-    touching: float = 0.4
-    gap: Range = (0.1, 2.5)
-    along_z: float = 0.5
+    beside_size: Size = (5.0, 40.0)
+    second_vessel: Probability = 0.3
+    touching: Probability = 0.4
+    gap: Amount = (0.1, 2.5)
+    along_z: Probability = 0.5
     tilt: float = 40.0
-    bend_probability: float = 0.25
-    bend_radius: Range = (3.0, 9.0)
-    gentle_radius: Range = (9.0, 80.0)
-    diameter: Range = (2.0, 5.0)
-    wall: Range = (0.1, 0.6)
+    bend_probability: Probability = 0.25
+    bend_radius: Size = (3.0, 9.0)
+    gentle_radius: Size = (9.0, 80.0)
+    diameter: Size = (2.0, 5.0)
+    wall: Amount = (0.1, 0.6)
     wall_hu: Range = (0.0, 110.0)
     fibrous_hu: Range = (40.0, 140.0)
-    plain_probability: float = 0.08
+    plain_probability: Probability = 0.08
     lumen_hu: Range = (150.0, 700.0)
     unenhanced_hu: Range = (30.0, 150.0)
-    unenhanced_probability: float = 0.12
-    mixing_probability: float = 0.25
+    unenhanced_probability: Probability = 0.12
+    mixing_probability: Probability = 0.25
     mixing: Range = (-0.25, 0.25)
-    aspect: Range = (0.8, 1.0)
-    lumen_fraction: Range = (0.3, 0.9)
-    wide_lumen: float = 0.4
-    wide_fraction: Range = (0.8, 0.95)
-    lumen_aspect: Range = (0.6, 1.0)
-    eccentricity: Range = (0.0, 0.95)
+    aspect: Size = (0.8, 1.0)
+    lumen_fraction: Size = (0.3, 0.9)
+    wide_lumen: Probability = 0.4
+    wide_fraction: Size = (0.8, 0.95)
+    lumen_aspect: Size = (0.6, 1.0)
+    eccentricity: Amount = (0.0, 0.95)
     narrowing: Range = (0.0, 0.6)
     swelling: Range = (-0.15, 0.2)
-    bump_width: Range = (0.8, 4.0)
-    bulge_probability: float = 0.3
+    bump_width: Size = (0.8, 4.0)
+    bulge_probability: Probability = 0.3
     bulge: Range = (0.15, 0.7)
-    aneurysm_probability: float = 0.06
+    aneurysm_probability: Probability = 0.06
     aneurysm: Range = (0.2, 0.8)
-    branch_probability: float = 0.12
-    branch_ratio: Range = (0.35, 0.9)
-    core_probability: float = 0.6
+    branch_probability: Probability = 0.12
+    branch_ratio: Size = (0.35, 0.9)
+    core_probability: Probability = 0.6
     core_counts: tuple[float, ...] = (0.65, 0.25, 0.1)
-    core_size: Range = (0.3, 2.0)
-    core_contrast: Range = (10.0, 140.0)
-    core_negative: float = 0.65
-    cap: Range = (0.05, 0.4)
-    exponent: Range = (2.5, 8.0)
-    calcification_probability: float = 0.3
+    core_size: Size = (0.3, 2.0)
+    core_contrast: Size = (10.0, 140.0)
+    core_negative: Probability = 0.65
+    cap: Amount = (0.05, 0.4)
+    exponent: Size = (2.5, 8.0)
+    calcification_probability: Probability = 0.3
     calcification_hu: Range = (300.0, 1800.0)
-    calcification_size: Range = (0.15, 0.9)
-    spotty_probability: float = 0.5
-    spotty_size: Range = (0.15, 0.4)
-    ulcer_probability: float = 0.15
-    ulcer_size: Range = (0.25, 1.0)
-    thrombus_probability: float = 0.15
+    calcification_size: Size = (0.15, 0.9)
+    spotty_probability: Probability = 0.5
+    spotty_size: Size = (0.15, 0.4)
+    ulcer_probability: Probability = 0.15
+    ulcer_size: Size = (0.25, 1.0)
+    thrombus_probability: Probability = 0.15
     thrombus_hu: Range = (20.0, 110.0)
-    thrombus_size: Range = (0.25, 1.3)
-    flap_probability: float = 0.08
-    flap_thickness: Range = (0.15, 0.5)
-    occlusion_probability: float = 0.06
-    stent_probability: float = 0.06
+    thrombus_size: Size = (0.25, 1.3)
+    flap_probability: Probability = 0.08
+    flap_thickness: Size = (0.15, 0.5)
+    occlusion_probability: Probability = 0.06
+    stent_probability: Probability = 0.06
     stent_hu: Range = (1500.0, 7000.0)
-    stent_wire: Range = (0.08, 0.16)
-    halo_probability: float = 0.25
+    stent_wire: Size = (0.08, 0.16)
+    halo_probability: Probability = 0.25
     halo_hu: Range = (8.0, 45.0)
-    halo_width: Range = (0.4, 3.0)
-    halo_softness: Range = (0.05, 0.8)
-    strand_probability: float = 0.15
+    halo_width: Size = (0.4, 3.0)
+    halo_softness: Size = (0.05, 0.8)
+    strand_probability: Probability = 0.15
     strand_hu: Range = (15.0, 110.0)
-    nodule_probability: float = 0.12
+    nodule_probability: Probability = 0.12
     nodule_hu: Range = (-40.0, 90.0)
-    nodule_size: Range = (0.3, 1.2)
-    texture_probability: float = 0.25
-    texture_sd: Range = (0.0, 15.0)
-    texture_length: Range = (0.3, 2.0)
-    blur: Range = (0.03, 0.1)
-    motion: Range = (0.05, 0.3)
-    motion_probability: float = 0.25
+    nodule_size: Size = (0.3, 1.2)
+    texture_probability: Probability = 0.25
+    texture_sd: Amount = (0.0, 15.0)
+    texture_length: Size = (0.3, 2.0)
+    blur: Amount = (0.03, 0.1)
+    motion: Amount = (0.05, 0.3)
+    motion_probability: Probability = 0.25
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = _checked(field.name, str(field.type), getattr(self, field.name))
+            object.__setattr__(self, field.name, value)
+
+
+def _checked(name: str, kind: str, value: Any) -> object:
+    """A value of :class:`SceneConfig` of the kind that its annotation names.
+
+    Raises:
+        TypeError, ValueError: it is none.
+    """
+    if kind == "Probability":
+        return number(name, value, low=0.0, high=1.0)
+    if kind == "float":
+        return number(name, value, low=0.0, high=90.0, unit="°")
+    if kind == "tuple[float, ...]":
+        found = numbers(name, value, low=0.0)
+        if not sum(found) > 0.0:
+            raise ValueError(f"{name} must hold a frequency above 0, got {value!r}")
+        return found
+    low, high = numbers(
+        name, value, 2, positive=kind == "Size", low=None if kind == "Range" else 0.0
+    )
+    if kind == "tuple[int, int]":
+        low, high = whole(f"{name}[0]", value[0], 0), whole(f"{name}[1]", value[1], 0)
+    if low > high:
+        raise ValueError(f"{name} must be a range, the lower end first, got {value!r}")
+    return low, high
 
 
 @dataclass(frozen=True)

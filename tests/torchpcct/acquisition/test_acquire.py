@@ -13,6 +13,7 @@ from torchpcct.geometry import ConeBeam, VolumeGrid, full_turn
 from torchpcct.scanner import SiliconDetector, presets
 from torchpcct.scene import (
     Body,
+    Box,
     Ellipsoid,
     EllipticCylinder,
     Scene,
@@ -313,7 +314,23 @@ def test_refusals_come_early(plaque):
         ("three numbers", lambda: scan(region=VolumeGrid((45, 45), 0.2, INSET.center[1:]))),
         ("field of view|orbit", lambda: scan(region=VolumeGrid((4, 4, 4), 0.2, (0, 0, 500.0)))),
         ("rotation_s", lambda: scan(plaque_scene(motion_amplitude=2.0)[0])),
+        (r"exposure_s must be at most 1e\+12 s", lambda: scan(exposure_s=1e300)),
+        (r"'jar' reaches the tube, 626 mm from", lambda: scan(round_about(700.0), region=None)),
+        (r"'jar' reaches the detector, 472 mm", lambda: scan(round_about(500.0), region=None)),
+        (r"semi_axes\[0\] must lie in \[1e-09, 1e\+09\] mm", lambda: round_about(1e300)),
+        (r"semi_axes\[0\] must lie in", lambda: Ellipsoid(1e-300)),
+        (r"half_lengths\[1\] must lie in", lambda: Box((1.0, 1e300, 1.0))),
+        (r"position\[2\] must lie in", lambda: Ellipsoid(1.0, position=(0.0, 0.0, 1e30))),
     )
+
+
+def round_about(radius, material="water"):
+    return Scene([Body("jar", EllipticCylinder(radius), material)])
+
+
+def test_air_may_be_around_the_scanner():
+    scan = acquire(round_about(2000.0, "air"), scanner(8, 2))
+    assert bool((scan.line_integrals().abs() < 0.2).all())
 
 
 SMALL = ConeBeam(full_turn(360), 626.0, 1098.0, 1500, 4, (0.5, 0.35), detector="curved")

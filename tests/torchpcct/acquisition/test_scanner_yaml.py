@@ -92,13 +92,42 @@ def changed(values, part, **changes):
         ("detector", {"deep_mm": 1}, "scanner.detector: unknown deep_mm; it takes material, depth"),
         ("source", {"kv": 80}, "scanner.source: unknown kv; it takes kvp"),
         ("source", {"filtration": {"unobtainium": 1}}, "unknown material 'unobtainium'"),
-        ("filters", {"copper": -1}, "scanner.filters.copper must be"),
+        ("filters", {"copper": -1}, "scanner.filters.copper must lie in [0, 1e+06] mm, got -1"),
         ("bowtie", {"material": "pmma"}, "scanner.bowtie needs fan_angles_deg, thickness_mm"),
+        ("filters", {"copper": 1e300}, "scanner.filters.copper must lie in [0, 1e+06] mm"),
+        ("source", {"current_ma": 1e300}, "current_ma must be at most 1e+09 mA"),
+        ("source", {"output": 1e300}, "output must be at most 1e+09"),
+        ("source", {"focal_spot": [400, 400]}, "focal_spot[0] must lie in [0, 100] mm, got 400"),
+        ("geometry", {"pitch": 800}, "are columns, pitch, offset and sdd in one unit, mm?"),
     ],
 )
 def test_what_no_scanner_is_made_of_is_named(values, part, changes, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         scanner_of(changed(values, part, **changes))
+
+
+@pytest.mark.parametrize(
+    ("part", "changes", "message"),
+    [
+        ("source", {"current_ma": True}, "current_ma must be a number in mA, got True"),
+        ("source", {"filtration": {"aluminium": True}}, "filtration.aluminium must be a number"),
+        ("geometry", {"pitch": True}, "pitch must be a number in mm, got True"),
+    ],
+)
+def test_true_and_false_are_no_numbers(values, part, changes, message):
+    with pytest.raises(TypeError, match=re.escape(message)):
+        scanner_of(changed(values, part, **changes))
+
+
+def test_names_left_empty_and_a_single_threshold_are_meant(values):
+    silicon = {"kind": "silicon", "thresholds_kev": 25}
+    made = scanner_of({**values, "name": None, "detector": silicon})
+    assert (made.name, made.detector.thresholds_kev) == ("own scanner", (25.0,))
+    assert scanner_of({**values, "name": 7}).name == "7"
+    with pytest.raises(ValueError, match=r"thresholds_kev must begin below the tube's .* 5000 keV"):
+        scanner_of({**values, "detector": {**silicon, "thresholds_kev": [5000]}})
+    with pytest.raises(TypeError, match=r"scanner\.name must be a text, got \['a'\]"):
+        scanner_of({**values, "name": ["a"]})
 
 
 def test_what_lacks_or_is_unknown_is_named(values, tmp_path):
