@@ -60,7 +60,8 @@ def _calibrate(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     # Vectors, which take the place of what a file says of itself.
     made = found.geometry
     vectors = made if isinstance(made, VectorGeometry) else VectorGeometry.of(made)
-    about = [f"{_CALIBRATED}{arguments.scan.name}", *str(found).splitlines()]
+    scan_name = " ".join(arguments.scan.name.splitlines())  # of one line, as a comment is
+    about = [f"{_CALIBRATED}{scan_name}", *str(found).splitlines()]
     sized = "" if found.lengths == "mm" else " --pitch MM"
     if sized:
         about.append("lengths in pixels, the file does not know their size: give --pitch MM, too")

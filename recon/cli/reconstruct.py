@@ -26,6 +26,7 @@ from recon.cli.parsing import (
     difference_beside,
     executing,
     find_modules_here,
+    hint_of_missing,
     is_picture,
     length_of,
     motion_beside,
@@ -295,7 +296,9 @@ def _reconstruct_scan(arguments: argparse.Namespace, progress: ProgressBars) -> 
             tuple(math.ceil(e / arguments.voxel) for e in arguments.extent or (1.0, 1.0, 1.0))
         )
     if not arguments.scan.exists():
-        raise FileNotFoundError(f"{arguments.scan} does not exist (torchpcct simulate makes scans)")
+        raise FileNotFoundError(
+            f"{arguments.scan} does not exist{hint_of_missing('scan', arguments.scan)}"
+        )
     import yaml
 
     from recon.api import reconstruct

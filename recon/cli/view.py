@@ -19,6 +19,7 @@ from recon.cli.parsing import (
     check_output,
     command,
     difference_beside,
+    hint_of_missing,
     is_picture,
     length_of,
     without_ending,
@@ -165,7 +166,7 @@ def _view(arguments: argparse.Namespace, progress: ProgressBars) -> None:
     check_output(arguments, _is_page if page else is_picture, *files)
     for file in files:
         if not file.exists():
-            raise FileNotFoundError(f"no such file: {file}")
+            raise FileNotFoundError(f"no such file: {file}{hint_of_missing('files', file)}")
         if not _is_volume(file):
             raise ValueError(
                 f"{file} is a scan, not a volume: torchpcct reconstruct makes one, torchpcct info "

@@ -86,8 +86,13 @@ def test_the_command_writes_what_reconstruct_reads(here, cli):
     geometry = geometry_of(yaml.safe_load(written))
     assert geometry.column_offset == pytest.approx(0.23, abs=0.02)
     cli("reconstruct tooth.h5 --geometry tooth_geometry.yaml --voxel 0.5 --out v.nii.gz")
-    # Its own file is written anew, another one is not.
-    assert '"errors"' in cli("calibrate tooth.h5 --voxel 0.28 --extent 9.5 9.5 --json")
+    # Its own file is written anew, another one is not. A name of two lines is one line of YAML.
+    (here / "tooth.h5").rename(here / "to\noth.h5")
+    again = "--voxel 0.28 --extent 9.5 9.5 --out tooth_geometry.yaml --json"
+    assert '"errors"' in cli(f"calibrate 'to\noth.h5' {again}")
+    written = (here / "tooth_geometry.yaml").read_text(encoding="utf-8")
+    assert geometry_of(yaml.safe_load(written)) == geometry
+    (here / "to\noth.h5").rename(here / "tooth.h5")
     (here / "mine.yaml").write_text("kind: fan\n", encoding="utf-8")
     refusing = cli("calibrate tooth.h5 --out mine.yaml", status=2)
     assert "not made by torchpcct calibrate" in refusing

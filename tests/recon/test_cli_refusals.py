@@ -57,6 +57,9 @@ from train.__main__ import _parser as train_parser
         ("reconstruct none.h5 --out a.png", "unknown volume format"),
         ("reconstruct none.h5 --voxel 0 --out a.h5", "--voxel must be greater than 0 mm"),
         ("plaque none.h5 --out a", "none.h5"),
+        ("reconstruct p*.h5 --out a.h5", "p*.h5 does not exist (the shell replaces a pattern:"),
+        ("view v?.nii --out a.png", "no such file: v?.nii (the shell replaces a pattern: write"),
+        ("evaluate --scans s[0-9].h5 --out a", "without quotes, or does no file match?)"),
     ],
 )
 def test_refusals_name_value_and_remedy_and_leave_nothing(here, cli, words, message):

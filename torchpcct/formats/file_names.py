@@ -6,7 +6,9 @@ from __future__ import annotations
 import glob
 import itertools
 import re
+import unicodedata
 import warnings
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,6 +20,12 @@ _CHAIN = re.compile(r"\d+\.\d+\.\d+")
 """Sections, dates or identifiers rather than decimals."""
 _SHOWN = 4
 """File names that a message lists at most."""
+_FEW = 8
+"""Files of which no gap is told: too few to know how they count."""
+_LACKING = 0.1
+"""Share of the files that may be missing at most: where more are, they were left out on purpose."""
+_COUNT = 10
+"""Times the number of files that a count of views reaches at most; times of day are larger."""
 _ONE_KIND = (("tif", "tiff"), ("yaml", "yml"), ("h5", "hdf5", "hdf"), ("nxs", "nx", "nx5"))
 """Endings in small letters that name one format."""
 
@@ -28,7 +36,8 @@ def matching(pattern: str, folder: Path) -> list[Path]:
     A pattern may be an absolute path. Its ending is found in any capitals (``.TIF`` for ``.tif``)
     and, where no file has it, another one of the same format is (``.tiff``), unless it holds
     brackets (``*.ti[f]``). Hidden files (``._1.tif`` of a Mac) are left out, as a shell does. A
-    file that is called like the pattern itself is that file.
+    file or folder that is called like a part of the pattern itself is that one (``run [1]``).
+    Letters with accents are found in both of their encodings, which look alike.
 
     Args:
         pattern: ``*``, ``?``, ``[...]`` and ``**`` as in a shell.
@@ -38,16 +47,25 @@ def matching(pattern: str, folder: Path) -> list[Path]:
         FileNotFoundError: no file.
         ValueError: two files that differ in such endings alone, one image twice.
     """
-    if not glob.has_magic(pattern) or (folder / pattern).exists():
-        return [folder / pattern]
+    spellings = dict.fromkeys(
+        [pattern, *(unicodedata.normalize(form, pattern) for form in ("NFC", "NFD"))]
+    )
+    for spelling in spellings:
+        if (folder / spelling).exists():
+            return [folder / spelling]
+    if not glob.has_magic(pattern):
+        raise FileNotFoundError(f"no such file: {folder / pattern}{_hint(pattern)}")
     files: list[Path] = []
-    for wanted in _with_its_endings(pattern):
-        found = {folder / name for name in glob.glob(wanted, root_dir=folder, recursive=True)}
-        files += sorted(p for p in found if not p.is_dir() or p.suffix.lower() == ".zarr")
+    for place, part in (_without_folders(folder, spelling) for spelling in spellings):
+        for wanted in _with_its_endings(part):
+            found = {place / name for name in glob.glob(wanted, root_dir=place, recursive=True)}
+            files += sorted(p for p in found if not p.is_dir() or p.suffix.lower() == ".zarr")
+            if files:
+                break
         if files:
             break
     else:
-        raise FileNotFoundError(f"no file matches {folder / pattern}")
+        raise FileNotFoundError(f"no file matches {folder / pattern}{_hint(pattern)}")
     stems: dict[tuple[Path, tuple[str, ...]], Path] = {}
     for path in files:
         other = stems.setdefault((path.with_suffix(""), _kind(path.suffix[1:])), path)
@@ -58,6 +76,52 @@ def matching(pattern: str, folder: Path) -> list[Path]:
                 f"[{pattern[-1]}], to match it alone"
             )
     return in_number_order(files)
+
+
+def _without_folders(folder: Path, pattern: str) -> tuple[Path, str]:
+    """The folder in which the rest of a pattern is looked for: what leads there by its own name
+    may hold brackets and other characters of patterns."""
+    parts = Path(pattern).parts
+    while len(parts) > 1 and (folder / parts[0]).is_dir():
+        folder, parts = folder / parts[0], parts[1:]
+    return folder, str(Path(*parts))
+
+
+def _hint(pattern: str) -> str:
+    """What may have been meant by a name that no file has."""
+    if re.search(r"\{.*\}|%0?\d*d|#", pattern):
+        return ": patterns are written with * and ?, as p_*.tif"
+    if pattern.startswith("~") or "$" in pattern:
+        return ": ~ and $NAME are not replaced here, write the folder out"
+    if "[" in pattern:
+        return ": [0-9] stands for one of the characters in it, [[] for a bracket itself"
+    return ""
+
+
+def gap_in_numbers(paths: Sequence[Path]) -> str:
+    """Between which two of the files numbers are left out that count up in equal steps else; empty
+    where none are, or where the numbers are no count of views (a time of day, several numbers).
+
+    Args:
+        paths: of one series, in any order.
+    """
+    keys = [_parts(str(path.with_suffix("")), _WHOLE) for path in paths]
+    if len(paths) < _FEW or len({len(key) for key in keys}) > 1:
+        return ""
+    changing = [values for values in zip(*keys, strict=True) if len(set(values)) > 1]
+    if len(changing) != 1 or not all(isinstance(value, float) for value in changing[0]):
+        return ""
+    order = sorted(zip(map(float, changing[0]), paths, strict=True))
+    steps = [b[0] - a[0] for a, b in itertools.pairwise(order)]
+    usual = Counter(steps).most_common(1)[0][0]
+    if usual <= 0.0 or any(step % usual for step in steps):
+        return ""
+    first, last = order[0][0], order[-1][0]
+    lacking = (last - first) / usual + 1 - len(paths)
+    if not 0 < lacking <= _LACKING * len(paths) or last > _COUNT * len(paths) * usual:
+        return ""
+    at = next(k for k, step in enumerate(steps) if step > usual)
+    return f"{order[at][1].name} and {order[at + 1][1].name}"
 
 
 def _kind(ending: str) -> tuple[str, ...]:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 
 from torchpcct.formats.arrays import read_array
 from torchpcct.formats.damage import read_yaml, reading
+from torchpcct.formats.file_names import gap_in_numbers, matching
 from torchpcct.formats.geometry_yaml import geometry_of
 from torchpcct.formats.integer_readings import as_counted
 from torchpcct.geometry import Geometry
@@ -79,6 +81,19 @@ def _is_name(value: object) -> bool:
     return listed or isinstance(value, str)
 
 
+def _check_gaps(pattern: str, folder: Path) -> None:
+    """Warn where a file is missing among views that are evenly spaced, it is said."""
+    gap = gap_in_numbers(matching(pattern, folder))
+    if gap:
+        warnings.warn(
+            f"the numbers of {pattern} have a gap between {gap}: if views were not measured or are "
+            "lost there, all that follow would be at wrong angles; angles_deg as a list, or the "
+            "name of a text file, gives each its own",
+            UserWarning,
+            stacklevel=3,
+        )
+
+
 def read_stack(
     path: str | os.PathLike[str],
     geometry: Geometry | None = None,
@@ -134,6 +149,9 @@ def read_stack(
     }
     if "dead" in options:
         options["dead"] = np.asarray(options["dead"]).astype(bool)
+    evenly = isinstance(described, Mapping) and isinstance(described.get("angles_deg"), Mapping)
+    if isinstance(name, str) and evenly:
+        _check_gaps(name, folder)
     info: dict[str, object] = {"file": str(path), "format": "stack"}
     views, beam = geometry.views, geometry
     kept: list[int] = []

@@ -1,5 +1,9 @@
 """Which files a pattern means, and in which order they are read."""
 
+import unicodedata
+import warnings
+from pathlib import Path
+
 import numpy as np
 import pytest
 import tifffile
@@ -8,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchpcct import ParallelBeam
-from torchpcct.formats.file_names import in_number_order, matching
+from torchpcct.formats.file_names import gap_in_numbers, in_number_order, matching
 from torchpcct.formats.geometry_yaml import geometry_of, geometry_values
 from torchpcct.formats.scans import open_scan
 
@@ -132,6 +136,81 @@ def test_a_pattern_may_be_absolute_and_its_folder_may_hold_brackets(tmp_path):
     assert matching("v[0].tif", tmp_path) == [tmp_path / "v[0].tif"]
     with pytest.raises(FileNotFoundError, match=r"no file matches .*q\*\.tif"):
         matching("q*.tif", tmp_path)
+    # Also where the folder stands in the pattern; the one of that very name goes before others.
+    for folder in ("run [1]", "run 1", "a\nb", "ünï"):
+        found = stack(tmp_path / "at" / folder, "p*.tif", names)
+        np.testing.assert_array_equal(found, READINGS[:, 0])
+    at = tmp_path / "at"
+    for pattern in ("run [1]/p*.tif", f"{at}/run [1]/p*.tif", "run 1/../run [1]/p0*.tif"):
+        assert {path.parent.resolve() for path in matching(pattern, at)} == {at / "run [1]"}
+    assert [p.parent.name for p in matching("run [0-9]/p00.tif", at)] == ["run 1"]
+    assert [p.name for p in matching("a\nb/*.tif", at)] == names
+    # Two encodings of one umlaut, of Macs and of others.
+    for form in ("NFC", "NFD"):
+        pattern = unicodedata.normalize(form, "ünï/p*.tif")
+        assert [p.name for p in matching(pattern, at)] == names
+        assert matching(pattern.replace("*", "00"), at)[0].exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("p_{000..023}.tif", r"no such file: .*: patterns are written with \* and \?"),
+        ("p_%03d.tif", "patterns are written with"),
+        ("p_###.tif", "patterns are written with"),
+        ("~/p*.tif", r"no file matches .*: ~ and \$NAME are not replaced"),
+        ("$HOME/p.tif", "are not replaced"),
+        ("q_[0-9].tif", r"\[\[\] for a bracket itself"),
+        ("q_1.tif", "q_1.tif$"),
+        ("q_*.tif", r"q_\*\.tif$"),
+    ],
+)
+def test_names_that_no_file_has_say_how_patterns_are_written(tmp_path, name, hint):
+    with pytest.raises(FileNotFoundError, match=hint):
+        matching(name, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "gap"),
+    [
+        ([k for k in range(13) if k != 9], "p000008.tif and p000010.tif"),
+        ([0, 10, *range(30, 130, 10)], "p000010.tif and p000030.tif"),
+        ([k + 101 for k in range(13) if k != 5], "p000105.tif and p000107.tif"),
+        (range(12), ""),
+        (range(7, 67, 5), ""),
+        ([3, 4, 9, 11, 14, 18, 19, 25, 27, 30, 31, 40], ""),  # left out on purpose
+        ([120001 + k + (k > 4) for k in range(12)], ""),  # a time of day
+    ],
+)
+def test_a_file_that_is_missing_between_evenly_spaced_views_is_warned_of(tmp_path, numbers, gap):
+    names = [f"p{k:06d}.tif" for k in numbers]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = stack(tmp_path, "p*.tif", names)
+    np.testing.assert_array_equal(found, READINGS[:, 0])
+    said = [str(w.message) for w in caught if "have a gap" in str(w.message)]
+    assert len(said) == bool(gap)
+    if gap:
+        assert f"the numbers of p*.tif have a gap between {gap}: if views" in said[0]
+        # Views with an angle each, and files in a list, are as they are given.
+        listed = {**geometry_values(GEOMETRY), "angles_deg": np.degrees(GEOMETRY.angles).tolist()}
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            stack(tmp_path, "p*.tif", names, listed)
+            stack(tmp_path, names, names)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.sampled_from(["p_{:04d}.tif", "{}.tif", "run2_{:03d}.tif", "a_{:02d}_b.tif"]),
+    st.integers(0, 999),
+    st.integers(1, 12),
+    st.integers(2, 400),
+)
+def test_series_without_a_gap_have_none(form, first, step, count):
+    names = [Path(form.format(first + step * k)) for k in range(count)]
+    assert gap_in_numbers(names) == ""
+    assert gap_in_numbers([*names, Path("flat_1.tif")]) == ""
 
 
 def test_multi_page_files_in_capitals_and_of_several_kinds(tmp_path):
