@@ -20,8 +20,8 @@ import tempfile
 import threading
 import time
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +43,10 @@ _BLOCK = 512
 """Bytes in front of an HDF5 file that hold its checksum: the smallest user block."""
 _ABANDONED_S = 60.0
 """Seconds without a write after which a temporary file counts as abandoned."""
+_LONGEST_WAIT_S = 60.0
+"""Seconds that a write waits for others that write the same files: far longer than renames take."""
+_PAUSE_S = 0.02
+"""Seconds between two looks whether they have ended."""
 _MAGIC = b"torchpcct, HDF5 from byte 512, SHA-256 of it: "
 """Beginning of that block."""
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -239,6 +243,85 @@ def marker(folder: str | os.PathLike[str]) -> Iterator[Path]:
         yield part
     finally:
         _remove(part)
+
+
+def write_together(folder: str | os.PathLike[str], contents: Mapping[str, bytes]) -> list[Path]:
+    """Write files that belong together: all of them or, where one cannot be written, none.
+
+    Of processes that write the same files at once, one has written all that is there at the end.
+
+    Args:
+        folder: it exists.
+        contents: file name → its content.
+
+    Raises:
+        FileNotFoundError: the folder does not exist.
+        WriteError: the system refuses to write.
+    """
+    out = Path(folder)
+    with ExitStack() as stack:
+        parts = {name: stack.enter_context(atomic_write(out / name)) for name in contents}
+        for name, part in parts.items():
+            try:
+                with part.open("wb") as file:
+                    file.write(contents[name])
+                    file.flush()
+                    os.fsync(file.fileno())
+            except OSError as error:
+                raise _write_error(out / name, error) from error
+        finished = stack.pop_all()
+    with alone(out, wait_s=_LONGEST_WAIT_S), finished:
+        pass
+    return [out / name for name in contents]
+
+
+class FolderInUseError(OSError):
+    """Another process holds the folder."""
+
+
+@contextmanager
+def alone(folder: str | os.PathLike[str], wait_s: float | None = None) -> Iterator[None]:
+    """Hold a folder during a block, against other blocks of any process that hold it; a process
+    that dies holds it no longer.
+
+    Where the system has no such locks (Windows, some network drives) nothing is held, nor where
+    the folder does not exist.
+
+    Args:
+        folder: to hold. No file is made in it.
+        wait_s: how long to wait for others, in s; after that the block runs all the same. None: it
+            is refused at once.
+
+    Raises:
+        FolderInUseError: another one holds it, and ``wait_s`` is None.
+    """
+    try:
+        import fcntl
+
+        handle = os.open(folder, os.O_RDONLY)
+    except (ImportError, OSError):
+        yield
+        return
+    try:
+        until = time.monotonic() + (wait_s or 0.0)
+        while True:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if wait_s is None:
+                    raise FolderInUseError(
+                        f"another process writes into {folder}: wait until it has ended, or name "
+                        "another folder"
+                    ) from None
+                if time.monotonic() < until:
+                    time.sleep(_PAUSE_S)
+                    continue
+            except OSError:  # no locks of folders on this drive
+                pass
+            break
+        yield
+    finally:
+        os.close(handle)
 
 
 class _Unfailing(io.FileIO):

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, TextIO
 from matplotlib.image import imsave
 from tqdm import tqdm
 
-from torchpcct.files import atomic_write
+from torchpcct.files import WriteError, atomic_write
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
@@ -76,8 +76,11 @@ class Table:
             return
         if self._file is None:
             self._file = open(self.path, "a", encoding="utf-8", newline="")  # noqa: SIM115 (stays open)
-        self._writer(self._file).writerow(row)
-        self._file.flush()
+        try:
+            self._writer(self._file).writerow(row)
+            self._file.flush()
+        except OSError as error:
+            raise WriteError(f"cannot write {self.path}: {error.strerror or error}") from error
 
     def sync(self) -> None:
         """Onto the disk: a checkpoint must not be newer than the rows before it."""

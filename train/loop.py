@@ -15,12 +15,13 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torch import nn
 
+from torchpcct.files import alone
 from train.config import TrainConfig
 from train.data import Data, InTurn
 from train.logs import Logs
@@ -68,6 +69,7 @@ def train(
 
     Raises:
         FileExistsError: ``out`` is not empty, and ``resume`` is false.
+        FolderInUseError: another process trains in ``out``.
         TensorFileError: no whole checkpoint to resume from, or it belongs to another model.
         ValueError: the configuration is not the checkpoint's, or there are more processes than
             scenes in a batch.
@@ -79,8 +81,23 @@ def train(
             f"batch ({config.batch}) must be at least the number of processes ({group.size})"
         )
     run = Run(config, model, group, Path(out))
-    run.begin(resume, command)
-    state = run.state
+    if run.writes and not resume:
+        run.out.mkdir(parents=True, exist_ok=True)
+    with alone(run.out) if run.writes else nullcontext():
+        run.begin(resume, command)
+        return _trained(run, data, held_out, objective, progress, tensorboard)
+
+
+def _trained(
+    run: Run,
+    data: Data | InTurn,
+    held_out: Data,
+    objective: Objective,
+    progress: bool,
+    tensorboard: bool,
+) -> tuple[State, int]:
+    """The steps of a run that has begun; see :func:`train`."""
+    config, model, group, state = run.config, run.model, run.group, run.state
     with _logs(run, progress, tensorboard), _signals(group.size == 1) as caught:
         run.save()
         stop = False

@@ -170,7 +170,8 @@ class Run:
                 )
         if self.writes:
             self.store.clean()
-            (self.out / "config.yaml").write_text(self.config.to_yaml(), encoding="utf-8")
+            with atomic_write(self.out / "config.yaml") as part:
+                part.write_text(self.config.to_yaml(), encoding="utf-8")
         done = state.step - state.skipped
         self.rate = LambdaLR(
             self.adam, lambda update: rate_factor(self.config, update), last_epoch=done - 1

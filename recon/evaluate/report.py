@@ -22,7 +22,7 @@ import numpy as np
 
 from recon.evaluate.estimates import Record
 from recon.evaluate.experiment import Evaluation, TaskResult
-from torchpcct.files import atomic_write
+from torchpcct.files import write_together
 from torchpcct.viz import base64_text
 
 if TYPE_CHECKING:
@@ -235,7 +235,8 @@ def write_report(
     figures: Mapping[str, Figure],
     more: Mapping[str, bytes] | None = None,
 ) -> list[Path]:
-    """Write a report into ``folder`` (made if need be), each file whole.
+    """Write a report into ``folder`` (made if need be), all files of it or, where one cannot be
+    written, none.
 
     Args:
         folder: for ``report.json``, ``report.md``, the figures and ``report.html``.
@@ -262,10 +263,7 @@ def write_report(
         **pictures,
     }
     contents["report.html"] = page(title, text, pictures).encode()
-    for name, content in contents.items():
-        with atomic_write(out / name) as part:
-            part.write_bytes(content)
-    return [out / name for name in contents]
+    return write_together(out, contents)
 
 
 def _picture(seen: TaskResult) -> Figure:

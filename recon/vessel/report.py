@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -12,7 +13,7 @@ import numpy as np
 import torch
 
 from recon.vessel.reading import CERTAIN, PlaqueReading
-from torchpcct.files import atomic_write
+from torchpcct.files import write_together
 from torchpcct.viz import Panel, panels
 from torchpcct.volume import Volume
 
@@ -198,16 +199,17 @@ def save(
         "labels": {n: k for k, n in enumerate(names)},
         "info": dict(reading.info),
     }
-    for name, text in (
-        ("report.md", table(reading, others, deviations)),
-        ("report.json", json.dumps(data, indent=1) + "\n"),
-    ):
-        with atomic_write(folder / name) as part:
-            part.write_text(text, encoding="utf-8")
     Volume(torch.from_numpy(labels), reading.grid).save(folder / "tissues.nii.gz")
     Volume(torch.from_numpy(reading.image), reading.grid).save(folder / "image.nii.gz")
-    with atomic_write(folder / "plaque.png") as part:
-        picture(reading, others).savefig(part)
+    drawn = io.BytesIO()
+    picture(reading, others).savefig(drawn, format="png")
+    text = json.dumps(data, indent=1) + "\n"
+    contents = {
+        "report.md": table(reading, others, deviations).encode(),
+        "report.json": text.encode(),
+        "plaque.png": drawn.getvalue(),
+    }
+    write_together(folder, contents)
     return [
         folder / n
         for n in ("report.md", "report.json", "tissues.nii.gz", "image.nii.gz", "plaque.png")

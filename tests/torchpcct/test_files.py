@@ -2,6 +2,7 @@
 keyboard do meanwhile."""
 
 import os
+import resource
 import signal
 import threading
 from pathlib import Path
@@ -12,7 +13,15 @@ import pytest
 from fresh_python import run_python
 
 from recon.jobs.store import Store
-from torchpcct.files import WriteError, atomic_write, require_folder, write_hdf5
+from torchpcct.files import (
+    FolderInUseError,
+    WriteError,
+    alone,
+    atomic_write,
+    require_folder,
+    write_hdf5,
+    write_together,
+)
 
 FULL = """
 import os, resource, sys
@@ -166,3 +175,59 @@ def test_a_folder_that_is_removed_meanwhile_is_no_file(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "stat", looked_at)
     with pytest.raises(FileNotFoundError, match="cache does not exist, create it first"):
         require_folder(folder / "a.h5")
+
+
+NAMES = ("report.json", "report.md", "report.html")
+
+
+def test_files_that_belong_together_are_all_written_or_none(tmp_path):
+    """A limit on the size of files, for a full disk: the old report stays whole."""
+    write_together(tmp_path, dict.fromkeys(NAMES, b"old"))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
+    try:
+        with pytest.raises(WriteError, match=r"cannot write .*report\.md: File too large"):
+            write_together(tmp_path, {**dict.fromkeys(NAMES, b"new"), "report.md": bytes(9000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == dict.fromkeys(
+        NAMES, b"old"
+    )
+
+
+def test_of_two_writers_of_the_same_files_one_has_written_them_all(tmp_path, monkeypatch):
+    """The second one begins after the first one's first file is there."""
+    second = threading.Thread(
+        target=write_together, args=(tmp_path, dict.fromkeys(NAMES, b"second"))
+    )
+    real, replaced = os.replace, []
+
+    def replace(source, target):
+        real(source, target)
+        replaced.append(target)
+        if len(replaced) == 1:
+            second.start()
+            second.join(0.5)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", replace)
+        write_together(tmp_path, dict.fromkeys(NAMES, b"first"))
+        second.join()
+    assert len(replaced) == 2 * len(NAMES)
+    assert {(tmp_path / name).read_bytes() for name in NAMES} == {b"second"}
+
+
+def test_a_folder_is_held_by_one(tmp_path):
+    with alone(tmp_path):
+        with pytest.raises(FolderInUseError, match=r"another process writes into .*: wait until"):
+            alone(tmp_path).__enter__()
+        with alone(tmp_path / "another"):  # which is not there
+            pass
+        with alone(tmp_path, wait_s=0.01):  # waits, and goes on
+            pass
+    with alone(tmp_path), pytest.raises(FolderInUseError), alone(tmp_path):
+        pass
+    with pytest.raises(KeyError), alone(tmp_path):
+        raise KeyError
+    with alone(tmp_path):
+        assert list(tmp_path.iterdir()) == []

@@ -27,6 +27,7 @@ from tiny_training import (
 from torch import nn
 
 from recon.mbir.weights_io import TensorFileError, read_tensors
+from torchpcct.files import FolderInUseError, alone
 from train.checkpoint import CHECKPOINT_FORMAT, CheckpointStore
 from train.config import ObjectiveConfig
 from train.loop import train
@@ -219,6 +220,16 @@ def test_folder_in_use_is_refused(tmp_path):
     with pytest.raises(TensorFileError, match="no checkpoint to resume from"):
         run(tmp_path / "nothing", resume=True)
     assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
+
+
+def test_two_runs_at_once_in_one_folder_are_refused(tmp_path):
+    """Begun twice, or resumed while it still runs: they would write each other's checkpoints."""
+    (tmp_path / "x").mkdir()
+    with alone(tmp_path / "x"):
+        for resume in (False, True):
+            with pytest.raises(FolderInUseError, match="another process writes into"):
+                run(tmp_path / "x", resume=resume)
+    assert list((tmp_path / "x").iterdir()) == []
 
 
 # Optimisation
