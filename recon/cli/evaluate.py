@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -281,16 +282,30 @@ def _volumes(arguments: argparse.Namespace) -> tuple[list[Comparison], str, str]
             f"but not {reference}: --reference names the volume of a linear method without "
             "smoothing (FBP, kernel ram-lak)"
         )
+    alone = [str(files[name]) for files in stems for name in files if name not in names]
+    if alone:
+        arguments.warn(f"left out, as the other folder has none of that name: {', '.join(alone)}")
     pairs = {name: [Volume.load(s[name]) for s in stems] for name in names}
     grid, unit = pairs[reference][0].grid, pairs[reference][0].unit
     for name, both in pairs.items():
-        if any(not same_grid(v.grid, grid) or v.unit != unit for v in both):
-            raise ValueError(
-                f"{name} lies on another grid or has another unit than {reference}: "
-                f"{both[0].grid}, {grid}"
-            )
+        for files, volume in zip(stems, both, strict=True):
+            if not same_grid(volume.grid, grid):
+                raise ValueError(
+                    f"{files[name]} has the grid {volume.grid}, {stems[0][reference]} {grid}: "
+                    "resample it"
+                )
+            if volume.unit != unit:
+                raise ValueError(
+                    f"{files[name]} is in {volume.unit}, {stems[0][reference]} in {unit}: give all "
+                    "in one unit"
+                )
     data = {name: [v.data for v in both] for name, both in pairs.items()}
     base = data.pop(reference)
+    if not data:
+        raise ValueError(
+            f"{first} and {second} both have {reference} alone: put a volume of another method, of "
+            "the same name, into both"
+        )
     cells = _cells(stems[0][reference])
     found = evaluate_volumes(
         data, base, grid.spacing, _region(arguments.region, grid), cells_mm=cells
@@ -321,19 +336,7 @@ def _region(text: str | None, grid: VolumeGrid) -> Bools | None:
         return None
     mask: Bools = np.zeros(grid.shape, bool)
     if not Path(text).exists():
-        try:
-            parts = [
-                slice(*(int(end) if end else None for end in part.split(":")))
-                for part in text.split(",")
-            ]
-        except (ValueError, TypeError):
-            parts = []
-        if len(parts) != len(grid.shape):
-            raise ValueError(
-                f"--region {text}: neither an existing file nor ranges of voxels, "
-                f"Z0:Z1,Y0:Y1,X0:X1, within the {grid.shape} voxels"
-            )
-        mask[tuple(parts)] = True
+        mask[_ranges(text, grid.shape)] = True
     else:
         volume = Volume.load(text)
         if not same_grid(volume.grid, grid):
@@ -346,6 +349,31 @@ def _region(text: str | None, grid: VolumeGrid) -> Bools | None:
             f"--region {text} selects {int(mask.sum())} voxels, at least two are needed"
         )
     return mask
+
+
+def _ranges(text: str, shape: Sequence[int]) -> tuple[slice, ...]:
+    """Of voxels, ``Z0:Z1,Y0:Y1,X0:X1``, an end left out or counted from behind as in Python.
+
+    Raises:
+        ValueError: something else, or beyond the voxels.
+    """
+    axes, parts = "ZYX"[-len(shape) :], text.split(",")
+    ends = [re.fullmatch(r"\s*(-?\d+)?:(-?\d+)?\s*", part) for part in parts]
+    if len(parts) != len(shape) or None in ends:
+        form = ",".join(f"{axis}0:{axis}1" for axis in axes)
+        raise ValueError(
+            f"--region {text}: neither an existing file nor ranges of voxels, {form} (one voxel is "
+            f"5:6), within the {' × '.join(map(str, shape))} voxels"
+        )
+    found = [[None if v is None else int(v) for v in end.groups()] for end in ends if end]
+    for axis, n, part, pair in zip(axes, shape, parts, found, strict=True):
+        if any(v is not None and not -n <= v <= n for v in pair):
+            raise ValueError(
+                f"--region {text}: {part.strip()} reaches beyond the {n} voxels along "
+                f"{axis.lower()}: ranges are of voxels, not mm; an end left out is that of the "
+                "volume"
+            )
+    return tuple(slice(*pair) for pair in found)
 
 
 def _denoiser(text: str) -> str:

@@ -27,13 +27,13 @@ from recon.evaluate.estimates import Record, ReferenceNoise, records_of
 from recon.evaluate.measure import BLOCK, Measurement, Reader, RoiReadings, kept_as
 from recon.evaluate.methods import Method, MethodLike, listed, method_of
 from recon.evaluate.realisations import Realisations, Simulated
-from recon.evaluate.task import GroundTruth, Task
+from recon.evaluate.task import GroundTruth, Task, exposures_of
 from recon.evaluate.tasks import TaskLike, read_task
 from recon.jobs import execute
 from recon.jobs.execute import Job, Unportable
 from recon.jobs.store import Store
 from torchpcct.files import atomic_write
-from torchpcct.validate import checked, numbers, whole
+from torchpcct.validate import checked, whole
 
 if TYPE_CHECKING:
     from torchpcct.typing import JsonObject
@@ -120,12 +120,8 @@ def evaluate(
     n, seed = whole("n", n, LEAST), whole("seed", seed, 0)
     todo = [read_task(t) for t in listed(tasks)]
     run = [method_of(m) for m in listed(methods)]
-    for kind, names in (("tasks", [t.name for t in todo]), ("methods", [m.name for m in run])):
-        twice = {name for name in names if names.count(name) > 1}
-        if twice:
-            raise ValueError(
-                f"{kind}: {', '.join(sorted(twice))} given twice; give one of them another name"
-            )
+    _different("tasks", [t.name for t in todo])
+    _different("methods", [m.name for m in run])
     weighted = [m.name for m in run if m.energies is not None]
     if weighted and not any(t.has_energies for t in todo):
         painted = ", ".join(t.name for t in todo)
@@ -133,11 +129,7 @@ def evaluate(
             f"{', '.join(weighted)}: the tissues of {painted} are given in HU, without energies; "
             "energies= takes tasks whose scene is made of bodies alone"
         )
-    exposures = (
-        None
-        if exposures_s is None
-        else tuple(numbers("exposures_s", listed(exposures_s), positive=True, unit="s"))
-    )
+    exposures = None if exposures_s is None else exposures_of(listed(exposures_s))
     if folder is None:
         with TemporaryDirectory() as kept:
             return evaluate(
@@ -600,6 +592,38 @@ def _finished(
     return True
 
 
+def _different(kind: str, names: list[str]) -> None:
+    """Refuse a name that is given twice (ValueError)."""
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise ValueError(
+            f"{kind}: {', '.join(sorted(twice))} given twice; give one of them another name"
+        )
+
+
+def _note_export(task: Task, seed: int, folder: Path) -> None:
+    """Note beside exported scans what they are of, so that none of other noise or of another task
+    ever lie among them.
+
+    Raises:
+        ValueError: there are scans of something else.
+    """
+    noted = folder / "export.json"
+    what = {"task": task.fingerprint, "seed": seed}
+    try:
+        before = json.loads(noted.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        before = None
+    if any(folder.glob("*.h5")) and before != what:
+        raise ValueError(
+            f"{folder} holds scans of another seed or task, or of another version of it: export "
+            "into a new folder"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic_write(noted) as part:
+        part.write_text(json.dumps(what) + "\n", encoding="utf-8")
+
+
 @checked
 def export_scans(
     tasks: TaskLike | Sequence[TaskLike],
@@ -630,16 +654,17 @@ def export_scans(
         The files of the scans.
 
     Raises:
-        ValueError, TypeError: as of :func:`evaluate`.
+        ValueError, TypeError: as of :func:`evaluate`; a folder that holds scans of another task or
+            seed.
     """
     n, seed = whole("n", n, LEAST), whole("seed", seed, 0)
-    exposures = (
-        None
-        if exposures_s is None
-        else numbers("exposures_s", listed(exposures_s), positive=True, unit="s")
-    )
+    exposures = None if exposures_s is None else exposures_of(listed(exposures_s))
     written = []
-    for task in map(read_task, listed(tasks)):
+    todo = [read_task(t) for t in listed(tasks)]
+    _different("tasks", [t.name for t in todo])
+    for task in todo:
+        _note_export(task, seed, Path(folder) / task.name)
+    for task in todo:
         with TemporaryDirectory() as kept:
             realisations = Realisations(task, Store(Path(kept)), seed)
             for exposure in exposures or task.exposures_s:

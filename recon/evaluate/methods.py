@@ -30,7 +30,8 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
@@ -230,10 +231,13 @@ def denoiser(function: Callable[..., object], base: MethodLike, name: str = "") 
     plain = getattr(function, "__name__", "denoiser")
     denoise = denoiser_of(function)
 
-    def run(realisation: Realisation) -> Any:
-        return denoise(before.run(realisation), lambda: realisation.sigma(before))
-
     name = name or f"{plain}@{before.name}"
+
+    def run(realisation: Realisation) -> Any:
+        volume = before.run(realisation)
+        with _naming(name):
+            return denoise(volume, lambda: realisation.sigma(before))
+
     made = denoiser, (function, before, name)
     return Method(name, run, key=_source_of(function), kernels=before.kernels, made=made)
 
@@ -278,11 +282,26 @@ def _mbir(spec: str, rest: str) -> Method:
     )
 
 
+@contextmanager
+def _naming(name: str) -> Iterator[None]:
+    """Put the name of a user's function before what it, or a library that it calls, refuses."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        kind = TypeError if isinstance(error, TypeError) else ValueError
+        raise kind(f"{name}: {error}") from error
+
+
 def _of_function(name: str, function: Callable[..., Any]) -> Method:
     made = _of_function, (name, function)
+
+    def run(realisation: Realisation) -> Any:
+        with _naming(name):
+            return function(realisation.scan, realisation.grid)
+
     return Method(
         name,
-        lambda realisation: function(realisation.scan, realisation.grid),
+        run,
         key=_source_of(function),
         made=made,
     )

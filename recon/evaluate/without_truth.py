@@ -31,10 +31,11 @@ from torchpcct.metrics.equal_resolution import noise_at_equal_resolution
 from torchpcct.metrics.half_split import HalfSplit, halves
 from torchpcct.scan import Scan
 from torchpcct.scan_grid import cells_at_axis, finite_cells
-from torchpcct.validate import checked, whole
+from torchpcct.validate import checked, numbers, reals, whole
 
 if TYPE_CHECKING:
     from recon.mbir.mbir import Mbir
+    from torchpcct.typing import Bools
 
 __all__ = ["evaluate_scans", "evaluate_volumes"]
 
@@ -61,6 +62,8 @@ _REFERENCE = "fbp:ram-lak"
 """Linear method without apodisation, which shows the resolution that the data hold."""
 _COARSE = 1.05
 """Cells at the axis: on voxels that are larger FBP would alias noise."""
+_SAME_CELLS = 0.05
+"""Difference of ln(cell at the axis) of one scanner's scans, as calibrations find it."""
 _SAME_LIGHT = 0.02
 """Difference of ln(mean reading in air) of scans whose views may be exchanged."""
 
@@ -140,8 +143,8 @@ def evaluate_scans(
         than that of :func:`recon.reconstruct` on the coarse voxels.
 
     Raises:
-        ValueError, TypeError: no two scans of one kind; ``n`` > 1 of one scan, whose halves have no
-            views in common; what the methods refuse.
+        ValueError, TypeError: no two scans of one kind, unit and size of cells; ``n`` > 1 of one
+            scan, whose halves have no views in common; what the methods refuse.
     """
     given: Sequence[Scan] = [scans] if isinstance(scans, Scan) else list(scans)
     n, seed = whole("n", n, 1), whole("seed", seed, 0)
@@ -159,6 +162,7 @@ def evaluate_scans(
             f"the scans have {tuple(given[0].counts.shape)} and {tuple(given[1].counts.shape)} "
             "readings: two scans of one object by one scanner are needed"
         )
+    _require_alike(*given)
     if n > 1 and given[0].geometry != given[1].geometry:
         raise ValueError(
             "views can be exchanged between scans of the same geometry only: leave out n"
@@ -184,6 +188,30 @@ def evaluate_scans(
             row["note"] = _note(given[0], grid)
         rows.append(measured)
     return rows[0] if n == 1 else [_mean(list(same)) for same in zip(*rows, strict=True)]
+
+
+def _require_alike(first: Scan, second: Scan) -> None:
+    """Refuse (ValueError) scans by different scanners or of other units: what tells them apart
+    would count as noise."""
+    one, other = first.geometry, second.geometry
+    if first.unit != second.unit:
+        raise ValueError(
+            f"the scans give volumes in {first.unit} and {second.unit}: give both the same "
+            "mu_water and pitch"
+        )
+    cells = list(zip(cells_at_axis(one), cells_at_axis(other), strict=True))
+    if one.parallel != other.parallel or any(
+        a != b and not abs(math.log(a / b)) <= _SAME_CELLS for a, b in cells
+    ):
+        beams = [
+            f"{'parallel' if g.parallel else 'divergent'} rays on cells of "
+            f"{_lengths(finite_cells(g))} mm at the axis"
+            for g in (one, other)
+        ]
+        raise ValueError(
+            f"the scans have {beams[0]}, and {beams[1]}: two scans of one object by one scanner "
+            "are needed"
+        )
 
 
 def require_no_energies(methods: Sequence[Method]) -> None:
@@ -358,13 +386,24 @@ def evaluate_volumes(
         than the detector's cells (empty: they are not).
 
     Raises:
-        ValueError: volumes of other shapes, NaN; constant ones, or two that are the same.
+        ValueError: no volumes; of other shapes, NaN; constant ones, or two that are the same;
+            lengths that are not positive, a region that is no mask.
+        TypeError: volumes that hold no real numbers.
     """
+    if not volumes:
+        raise ValueError("volumes must name a method's two volumes, beside the reference: got none")
     base = _split("reference", reference)
-    spacing = np.ravel(voxel_mm).astype(np.float64)
-    spacing = np.array([spacing[0], *spacing]) if spacing.size == 2 else np.broadcast_to(spacing, 3)
-    mask = None if region is None else np.asarray(region, bool).reshape(base.first.shape)
-    note = _condition(tuple(spacing), cells_mm)
+    given = np.ravel(reals("voxel_mm", voxel_mm))
+    spacing = tuple(numbers("voxel_mm", given, positive=True, unit="mm"))
+    if len(spacing) > 3:
+        raise ValueError(f"voxel_mm must be one length or (z, y, x), got {spacing}")
+    spacing = (spacing[0], *spacing) if len(spacing) == 2 else spacing * (3 // len(spacing))
+    mask = None if region is None else _mask(region, base.first.shape)
+    if cells_mm is not None:
+        cells_mm = numbers("cells_mm", cells_mm, positive=True, unit="mm")
+        if len(cells_mm) > 3:
+            raise ValueError(f"cells_mm must be at most three, ([z,] y, x), got {cells_mm}")
+    note = _condition(spacing, cells_mm)
     found: list[Comparison] = []
     for name, pair in dict(volumes).items():
         split = _split(name, pair)
@@ -374,7 +413,7 @@ def evaluate_volumes(
                 f"{tuple(base.first.shape)}"
             )
         try:
-            seen = noise_at_equal_resolution(split, base, tuple(spacing), mask)
+            seen = noise_at_equal_resolution(split, base, spacing, mask)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error
         factor = seen.dose_factor
@@ -417,8 +456,26 @@ def _condition(spacing: Sequence[float], cells: Sequence[float] | None) -> str:
     )
 
 
+def _mask(region: object, shape: Sequence[int]) -> Bools:
+    """A region as a mask of the volumes.
+
+    Raises:
+        TypeError, ValueError: another shape, values besides True and False (1 and 0).
+    """
+    given = reals("region", region)
+    if [n for n in given.shape if n > 1] != [n for n in shape if n > 1]:
+        raise ValueError(
+            f"region must be a mask of the volumes' shape {tuple(shape)}, got {given.shape}"
+        )
+    if not np.isin(given, (0.0, 1.0)).all():
+        raise ValueError("region must be a mask, True where noise is measured: volume > threshold")
+    return given.reshape(shape).astype(bool)
+
+
 def _split(name: str, pair: Sequence[object]) -> HalfSplit:
-    first, second = (torch.as_tensor(np.asarray(v)).double() for v in pair)
+    if len(pair) != 2:
+        raise ValueError(f"{name}: two volumes of two scans are needed, got {len(pair)}")
+    first, second = (torch.as_tensor(reals(f"{name}: a volume", v)) for v in pair)
     if first.shape != second.shape or first.ndim not in (2, 3):
         raise ValueError(
             f"{name}: two volumes (z, y, x) of one shape are needed, got {first.shape} and "

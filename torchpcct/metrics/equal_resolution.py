@@ -78,6 +78,8 @@ _BORDER = 16
 continue a volume."""
 _ROUGH = "its transfer relative to the reference is no smooth function of the frequency"
 """Why there is no factor, for messages."""
+_SMALL = "the region is too small to tell how certain its noise is"
+"""The same."""
 _WIDEST = math.log(100.0)
 """Half the interval of ln(factor), above which there is no factor."""
 _MATCH = 0.01
@@ -360,6 +362,11 @@ class _Match:
                 noise, math.nan, math.nan, nothing, math.inf, math.inf, shown[0], shown[1], why
             )
 
+        if not noise > 0.0:
+            return without(
+                "its two volumes do not differ in the region: does it lie outside of what was "
+                "measured?"
+            )
         if not self.shared.any():
             return without("the two volumes of the reference have nothing in common but noise")
         start = self._start()
@@ -387,12 +394,11 @@ class _Match:
         for k in np.flatnonzero(self._of_bricks(np.ones(self.shape), weight) > 0):
             change = _solved(left.sum(0) - left[k], right.sum(0) - right[k])
             up, down = above.sum() - above[k], below.sum() - below[k]
-            rest.append(
-                math.log(max(up, 1e-300) / max(down, 1e-300))
-                + float((slope.sum(0) - slope[k]) @ change) / up
-            )
+            if not min(up, down) > 0.0:
+                return without(_SMALL)
+            rest.append(math.log(up / down) + float((slope.sum(0) - slope[k]) @ change) / up)
         if len(rest) < 3:
-            return without("the region is too small to tell how certain its noise is")
+            return without(_SMALL)
         borders = np.ones(self.shape)
         left, right, _ = self._equations(theta, borders)
         all_ = [float((v * v * mask).sum()) for v in (reference, method)]

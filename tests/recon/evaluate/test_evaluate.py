@@ -2,6 +2,7 @@
 
 import json
 import math
+import shlex
 import shutil
 import sys
 from dataclasses import replace
@@ -14,8 +15,9 @@ import yaml
 from scipy import ndimage
 from tiny_studies import INSERT
 
+from recon.cli import main
 from recon.evaluate.estimates import _Figures, pivot
-from recon.evaluate.experiment import evaluate
+from recon.evaluate.experiment import _note_export, evaluate, export_scans
 from recon.evaluate.measure import Reader, kept_as
 from recon.evaluate.methods import Method, denoiser, method_of, volume_files
 from recon.evaluate.names import TASKS
@@ -421,6 +423,26 @@ def test_volumes_of_another_program(here, cli):
     assert "has no volume" in cli(f"{command} --out q", 2)
 
 
+def test_scans_of_two_seeds_or_tasks_are_not_exported_into_one_folder(task, tmp_path):
+    """Volumes of a mixture would be read as noise realisations that they are not."""
+    folder = tmp_path / "insert"
+    _note_export(task, 3, folder)
+    (folder / "20s_000_present.h5").write_bytes(b"")
+    _note_export(task, 3, folder)  # the same export goes on
+    with pytest.raises(ValueError, match=r"insert holds scans of another seed or task, .* a new"):
+        export_scans(task, tmp_path, n=8, seed=4)
+    other = replace(task, tolerance_hu=1.0)
+    with pytest.raises(ValueError, match="holds scans of another seed or task"):
+        export_scans(other, tmp_path, n=8, seed=3)
+    (folder / "export.json").unlink()  # an export of an earlier version, or scans of the user's
+    with pytest.raises(ValueError, match="holds scans of another seed or task"):
+        export_scans(task, tmp_path, n=8, seed=3)
+    assert sorted(path.name for path in folder.iterdir()) == ["20s_000_present.h5"]
+    with pytest.raises(ValueError, match="tasks: insert given twice"):
+        export_scans([task, other], tmp_path / "new", n=8)
+    assert not (tmp_path / "new").exists()
+
+
 @pytest.mark.parametrize("slices", [False, True])
 def test_a_denoiser_of_deepinv(slices):
     """Its unit and its axes; the model sees values about 1."""
@@ -514,7 +536,7 @@ def test_two_measured_scans(task, folder):
         evaluate_scans(scans[0], task.grid, "fbp:soft", n=2)
 
 
-def test_volumes_in_two_folders(here, cli):
+def test_volumes_in_two_folders(here, cli, capsys):
     """Of other programs: noise at equal resolution, a row a method. A blur saves nothing, in no
     direction; half of its noise is four times the dose."""
     generator, grid = (
@@ -564,12 +586,34 @@ def test_volumes_in_two_folders(here, cli):
         ("--reference other", "both have fbp, half, mine"),
         ("--n 9", "--n applies to --scans"),
         ("--task rod", "simulated"),
-        ("--region 9:,:,:", "0 voxels"),
+        ("--region 3:3,:,:", "0 voxels"),
+        ("--region 9:,:,:", "9: reaches beyond the 4 voxels along z: ranges are of voxels, not mm"),
+        ("--region :,:,0:65", "0:65 reaches beyond the 64 voxels along x"),
+        ("--region=:,-65:,:", "-65: reaches beyond the 64 voxels along y"),
+        ("--region 3,5,5", "neither an existing file nor ranges of voxels, Z0:Z1,Y0:Y1,X0:X1 (one"),
+        ("--region 0:4:0,:,:", "neither an existing file nor ranges"),
+        ("--region :,:", "neither an existing file nor ranges"),
         ("--region nowhere", "neither an existing file nor ranges"),
         ("--method pwls", "--scans"),
     ):
         assert expected in cli(f"evaluate --volumes one two {options} --out m", 2)
     assert not (here / "m").exists()
+    Volume(pairs["fbp"][0], grid).save(here / "one" / "net.nii.gz")
+    capsys.readouterr()
+    assert main(shlex.split("evaluate --volumes one two --out odd")) == 0
+    alone = "left out, as the other folder has none of that name: one/net.nii.gz"
+    assert f"warning: {alone}\n" in capsys.readouterr().err
+    for name, changed in (
+        ("is in mm^-1, one/fbp.nii.gz in HU", Volume(pairs["fbp"][0], grid, unit="mm^-1")),
+        ("resample it", Volume(pairs["fbp"][0], VolumeGrid(grid.shape, 0.5))),
+    ):
+        changed.save(here / "two" / "half.nii.gz")
+        said = cli("evaluate --volumes one two --out m", 2)
+        assert name in said
+        assert "two/half.nii.gz" in said
+    (here / "lone").mkdir()
+    Volume(pairs["fbp"][0], grid).save(here / "lone" / "fbp.nii.gz")
+    assert "both have fbp alone: put" in cli("evaluate --volumes one lone --out m", 2)
     assert "no such file: no" in cli("evaluate --volumes one no", 2)
     assert "is not a folder" in cli("evaluate --volumes one mask.nii.gz", 2)
     assert "with --scans or --volumes" in cli("evaluate --task rod --region 1:2,3:4,5:6", 2)
@@ -632,6 +676,57 @@ def test_a_segmented_lesion_is_a_task(voxel_task, task, folder, tmp_path):
     found = evaluate(mine, ["fbp:soft"], n=8, folder=tmp_path / "found")
     slope = value(found, "slope", "fbp:soft", "lesion")["value"]
     assert 0.5 < slope < 1.1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            {"signal": 5},
+            "signal must be the name of a body of the scene, or a list of names, got 5",
+        ),
+        ({"signal": [["nodule"]]}, "signal must be the name"),
+        ({"signal": None}, "needs signal"),
+        ({"title": ["a"]}, r"title must be a text, got \['a'\]"),
+        ({"background": 5}, "background must be a text, got 5"),
+        ({"name": True}, "name must be a text, got True"),
+        ({"reference": "fbp:hard"}, "unknown kernel 'hard'"),
+        ({"reference": "mbir"}, "reference must be FBP, fbp:KERNEL, .* got 'mbir'"),
+        ({"reference": "nlm@fbp:soft"}, "reference must be FBP"),
+        ({"exposures_s": True}, r"exposures_s\[0\] must be a number in s, got True"),
+        ({"exposures_s": [1, 2, 1.0]}, "exposures_s has 1 s twice"),
+        ({"exposures_s": 1e300}, r"exposures_s\[0\] must be at most 1e\+06 s"),
+        ({"tolerance_hu": True}, "tolerance_hu must be a number in HU, got True"),
+        ({"inset": {"size": 5}}, "inset.size must be 3 numbers, got 5"),
+        ({"inset": {"size": {"z": 5, "y": 5}}}, "inset.size must have z, y and x in mm, got"),
+        ({"inset": {"size": [5, 5, 5], "center": 5}}, "inset.center must be 3 numbers, got 5"),
+        ({"inset": {"size": [5, 5, 5], "center": [0, 0, 1e30]}}, r"center\[2\] must lie in"),
+        ({"inset": {"size": [5, 5, 5], "voxel_mm": 1e-9}}, "voxel_mm must make 1 to 10000 voxels"),
+        ({"inset": {"size": [5, 5, 5], "voxel_mm": 9}}, "voxel_mm must make 1 to 10000 voxels"),
+        ({"inset": {"size": [1e300, 5, 5]}}, "voxel_mm must make"),
+    ],
+)
+def test_what_makes_no_task_is_named(tmp_path, change, said):
+    path = tmp_path / "mine.yaml"
+    values = {**yaml.safe_load(task_text("nodule")), **change}
+    path.write_text(yaml.safe_dump(values), encoding="utf-8")
+    with pytest.raises((ValueError, TypeError), match=said):
+        read_task(path)
+
+
+def test_what_a_task_leaves_empty_has_its_default(tmp_path):
+    path = tmp_path / "mine.yaml"
+    empty = dict.fromkeys(("name", "title", "background", "reference", "exposures_s", "rois"))
+    values = {**yaml.safe_load(task_text("nodule")), **empty}
+    path.write_text(yaml.safe_dump(values), encoding="utf-8")
+    made = read_task(path)
+    assert (made.name, made.title, made.background) == ("mine", "", "lung")
+    assert (made.reference, made.exposures_s) == ("fbp:soft", (0.35, 2.0))
+
+
+def test_an_exposure_given_twice_is_refused_before_anything_is_simulated(task):
+    with pytest.raises(ValueError, match=r"exposures_s has 0\.5 s twice"):
+        evaluate(task, "fbp:soft", exposures_s=[0.5, 0.5], n=8)
 
 
 @pytest.mark.parametrize(

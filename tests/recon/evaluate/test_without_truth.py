@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from sound_scans import CYLINDER, Solid, transmissions
 
 from recon import reconstruct
+from recon.evaluate.methods import denoiser
 from recon.evaluate.report import measured_text
 from recon.evaluate.without_truth import evaluate_scans, evaluate_volumes
 from torchpcct import ConeBeam, FanBeam, ParallelBeam, Scan, VolumeGrid, full_turn
@@ -116,3 +118,80 @@ def test_cells_at_the_axis():
     cone = ConeBeam(angles, 400.0, 800.0, 16, 8, (1.4, 0.7))
     assert cells_at_axis(cone) == (0.7, 0.35, 0.35)
     assert cells_at_axis(VectorGeometry.of(cone)) == pytest.approx((0.7, 0.35, 0.35))
+
+
+def test_scans_by_other_scanners_and_in_other_units_are_refused(scans):
+    """Their artefacts and values would count as noise; another start of the turn, or an axis that
+    was calibrated, does not matter."""
+    first, second = scans
+    g, grid = first.geometry, VolumeGrid((42, 42), 2.0)
+    fan = FanBeam(g.angles, 400.0, 800.0, CELLS, 2.0)
+
+    def pair(**changes):
+        return lambda: evaluate_scans([first, replace(second, **changes)], grid, "fbp:soft")
+
+    refused(
+        (r"volumes in HU and mm\^-1: give both the same mu_water", pair(unit="mm^-1")),
+        ("parallel rays on cells of 1 mm .* divergent rays on cells of 1 mm", pair(geometry=fan)),
+        (r"cells of 1 mm .* cells of 1\.1 mm", pair(geometry=replace(g, pitch=1.1))),
+    )
+    for sound in (
+        replace(g, offset=0.4),
+        replace(g, pitch=1.001),
+        VectorGeometry.of(g),
+        replace(g, angles=g.angles + 1e-3),
+    ):
+        (row,) = pair(geometry=sound)()
+        assert not row["why"]
+
+
+def test_regions_without_noise_have_no_factor_and_say_so(scans):
+    """Outside of what was measured, or within one brick: no warnings of numpy."""
+    grid = VolumeGrid((96, 96), 1.0)
+    for part, why in ((slice(0, 6), "does it lie outside"), (slice(45, 49), "too small")):
+        mask = np.zeros(grid.shape, bool)
+        mask[part, part] = True
+        (row,) = evaluate_scans(scans, grid, "fbp:soft", mask)
+        assert math.isnan(row["dose_factor"])
+        assert why in row["why"]
+
+
+def test_what_volumes_cannot_be_is_named():
+    draw = np.random.default_rng(0)
+    pairs = [[draw.normal(size=(1, 16, 16)) for _ in range(2)] for _ in range(2)]
+    mine, reference = {"mine": pairs[0]}, pairs[1]
+    mask = np.ones((16, 16))
+
+    def of(volumes, given, *rest, **options):
+        return lambda: evaluate_volumes(volumes, given, *rest, **options)
+
+    refused(
+        (r"voxel_mm\[0\] must be greater than 0 mm, got -1", of(mine, reference, -1.0)),
+        (r"voxel_mm\[0\] must be finite", of(mine, reference, math.nan)),
+        ("voxel_mm must be one length or", of(mine, reference, [1.0] * 4)),
+        (r"cells_mm\[1\] must be greater", of(mine, reference, 1.0, cells_mm=[1.0, -1.0])),
+        ("cells_mm must be at most three", of(mine, reference, 1.0, cells_mm=[1.0] * 4)),
+        ("volumes must name .* got none", of({}, reference, 1.0)),
+        ("mine: two volumes .* got 1", of({"mine": pairs[0][:1]}, reference, 1.0)),
+        ("reference: two volumes .* got 3", of(mine, [*reference, *reference[:1]], 1.0)),
+        ("mine: a volume must hold real numbers", of({"mine": ["x", "y"]}, reference, 1.0)),
+        ("mine: a volume must hold", of({"mine": [1j * v for v in pairs[0]]}, reference, 1.0)),
+        (r"region must be a mask of the volumes' shape", of(mine, reference, 1.0, mask[1:])),
+        ("region must be a mask, True where", of(mine, reference, 1.0, 0.5 * mask)),
+        ("region must be a mask, True where", of(mine, reference, 1.0, math.nan * mask)),
+    )
+    assert evaluate_volumes(mine, reference, (1.0, 1.0), mask)[0]["method"] == "mine"
+
+
+def test_what_a_users_function_refuses_has_its_name(scans):
+    def denoise(volume):
+        return math.sqrt(volume)
+
+    def reconstruction(scan, grid):
+        raise ValueError("too noisy")
+
+    grid = VolumeGrid((42, 42), 2.0)
+    refused(
+        ("denoise@fbp:soft: ", lambda: evaluate_scans(scans, grid, denoiser(denoise, "fbp:soft"))),
+        ("reconstruction: too noisy", lambda: evaluate_scans(scans, grid, reconstruction)),
+    )
