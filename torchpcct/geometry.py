@@ -54,9 +54,9 @@ _LENGTHS: Limits = {"positive": True, "low": 1e-9, "high": 1e12, "unit": "mm"}
 somebody counts in metres, and a source 1e12 mm away is farther than the moon is."""
 _MOST_CELLS = 10**7
 """Columns and rows at most: as many cells of a µm make a detector of 10 m."""
-_MOST_OFFSET = 1e7
-"""Cells between the detector's middle and the beam's axis at most: beyond, single precision no
-longer tells one cell from the next. Detectors of one cell that are moved sideways need 1e5."""
+_MOST_OFFSET = 1e9
+"""Cells between the detector's middle and the beam's axis at most: single ones of a nm, a metre
+aside. Detectors of many cells are seen at an angle long before."""
 _STEEPEST_RAD = math.radians(85.0)
 """Largest angle between a ray and the line from the source through the axis, on a flat detector:
 beyond, less than a thousandth of the light is left and a ray crosses eleven cells in a depth of
@@ -451,7 +451,7 @@ class FanBeam(_Divergent):
     Raises:
         ValueError: a count < 1, a length ≤ 0, ``sdd <= sod``, an unknown detector, a half-fan of
             90° or more (flat: 85°), what no scan can have (lengths beyond 1e-9 … 1e12 mm, 1e7
-            cells, angles beyond 1e9 rad).
+            cells, 1e9 off the axis, angles beyond 1e9 rad).
         TypeError: a value of the wrong kind.
     """
 
@@ -495,7 +495,7 @@ class ConeBeam(_Divergent):
     Raises:
         ValueError: a count < 1, a length ≤ 0, ``sdd <= sod``, an unknown detector, a half-fan of
             90° or more (flat: 85°), what no scan can have (lengths beyond 1e-9 … 1e12 mm, 1e7
-            cells, angles beyond 1e9 rad).
+            cells, 1e9 off the axis, angles beyond 1e9 rad).
         TypeError: a value of the wrong kind.
     """
 

@@ -17,7 +17,7 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
-from torchpcct.files import WriteError, atomic_write, require_folder, require_writable
+from torchpcct.files import WriteError, require_folder, require_writable, write_together
 from torchpcct.validate import meant, number, numbers, whole
 
 if TYPE_CHECKING:
@@ -395,12 +395,14 @@ def write_summary(
     file: Path = arguments.out
     text = as_json({"file": str(file), **summary})
     done = yaml.safe_dump(config, sort_keys=False, allow_unicode=True)
-    for ending, content in zip(_BESIDE, (text, done), strict=True):
-        try:
-            with atomic_write(file.with_name(file.name + ending)) as part:
-                part.write_text(content.rstrip() + "\n", encoding="utf-8")
-        except WriteError as error:
-            raise WriteError(f"{error}; {file} itself is written") from error
+    contents = {
+        file.name + ending: f"{content.rstrip()}\n".encode()
+        for ending, content in zip(_BESIDE, (text, done), strict=True)
+    }
+    try:
+        write_together(file.parent, contents)
+    except WriteError as error:
+        raise WriteError(f"{error}; {file} itself is written") from error
     print(text if arguments.json else f"{file}: {short}")
 
 

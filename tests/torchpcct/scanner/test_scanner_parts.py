@@ -233,7 +233,7 @@ BAD = {
         ({"output": -1.0}, "output must be"),
         ({"anode_angle_deg": 1.0}, "anode_angle_deg must lie"),
         ({"current_ma": 0.0}, "current_ma must be"),
-        ({"focal_spot": (-1.0, 0.5)}, r"focal_spot\[0\] must be at least 0 mm"),
+        ({"focal_spot": (-1.0, 0.5)}, r"focal_spot\[0\] must lie in \[0, 100\] mm, got -1"),
         ({"filtration": 2.0}, "pairs"),
         ({"focal_spot": 0.5}, "focal_spot must be 2 numbers"),
         ({"filtration": ()}, "filtration must not be empty"),
@@ -270,7 +270,7 @@ BAD = {
         ({"bowties": ("large",)}, "Bowtie objects"),
         ({"filters": (("aluminium", 3.0),)}, "Material, mm"),
         ({"energy_bin_kev": 0.0}, "energy_bin_kev"),
-        ({"filters": ((ALUMINIUM, -3.0),)}, "must be at least 0 mm"),
+        ({"filters": ((ALUMINIUM, -3.0),)}, r"must lie in \[0, 1e\+06\] mm, got -3"),
     ),
     presets.pcct: (
         ({"bowtie": "medium"}, "unknown bowtie 'medium'"),
