@@ -181,7 +181,7 @@ def read_nexus(
             pitch, source = length_in(size)
         if options.get("flux") is None:
             options["flux"] = _flux(file, detector, key)
-        _check_rest(file, detector, key, pitch)
+        _check_at_rest(file, detector, key, pitch)
         part = None if slices is None else [*slices.indices(data.shape[1])[:2], data.shape[1]]
         return Frames(
             str(path),
@@ -291,7 +291,7 @@ def _flux(file: h5py.File, detector: str, key: Ints) -> Floats | None:
     return read[key == _PROJECTION] / (flats if flats.size else read[key == _PROJECTION]).mean()
 
 
-def _check_rest(file: h5py.File, detector: str, key: Ints, pitch: float | None) -> None:
+def _check_at_rest(file: h5py.File, detector: str, key: Ints, pitch: float | None) -> None:
     """Warn of an object that was moved by half a cell or more during the projections."""
     for name in ("x_translation", "y_translation", "z_translation"):
         data = _held(file, detector, f"sample/{name}")
