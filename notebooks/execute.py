@@ -43,7 +43,7 @@ MADE_BY: dict[str, tuple[str, ...]] = {
         *_MBIR,
         "train/loop.py",
         "train/objective.py",
-        "train/configs",
+        "train/configs/quick.yaml",
     ),
     "your_own_data.ipynb": (
         *_FBP,

@@ -147,7 +147,6 @@ def test_stored_notebook_is_of_the_shipped_weights(name):
         )
 
 
-@pytest.mark.extended
 @pytest.mark.parametrize("name", NAMES)
 def test_stored_notebook_is_of_the_sources_as_they_are(name):
     """A picture of an older program, 47 of 255 grey levels off, once stood there under weights
