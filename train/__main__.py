@@ -50,7 +50,8 @@ def _parser() -> Parser:
             "--config",
             Path,
             "FILE",
-            "YAML file (default: train/configs/default.yaml)",
+            "YAML file of what differs from a packaged configuration, its base (default: "
+            "train/configs/default.yaml)",
             {"read": True},
         ),
         ("--quick", bool, None, "train/configs/quick.yaml: a look at whether it works"),

@@ -1,9 +1,9 @@
 """Configuration of a training run and its YAML form.
 
-A YAML file holds the fields that differ from the defaults of :class:`TrainConfig`. Sections
-(``network``, ``data``, ``late``, ``objective``) are mappings. Unknown keys are errors, so that a
-misspelt one does not silently train the default. Every class checks its own values, whether they
-come from YAML or from Python.
+A YAML file holds the fields that differ from the defaults of :class:`TrainConfig`, or from those of
+a packaged configuration that its key ``base`` names. Sections (``network``, ``data``, ``late``,
+``objective``) are mappings. Unknown keys are errors, so that a misspelt one does not silently train
+the default. Every class checks its own values, whether they come from YAML or from Python.
 """
 
 from __future__ import annotations
@@ -42,6 +42,8 @@ _MOST_VOXELS = 1024
 """Voxels along an edge of the training inset at most."""
 _FASTEST = 10.0
 """Learning rate of Adam at most, which moves every weight by so much in a step."""
+_MERGED = ("data", "late", "objective")
+"""Sections that a file with a ``base`` gives in part."""
 VALIDATED_AT_ONCE = 4
 """Scenes that a validation reconstructs at a time."""
 
@@ -422,7 +424,8 @@ class TrainConfig:
 
     @classmethod
     def from_yaml(cls, text: str) -> Self:
-        """From YAML; fields left out keep their defaults.
+        """From YAML; fields left out are those of the packaged configuration that ``base`` names,
+        without ``base`` the defaults.
 
         Raises:
             ValueError: not a mapping of known keys to values of the right kind and range; the
@@ -433,7 +436,7 @@ class TrainConfig:
     @classmethod
     def of(cls, values: object) -> Self:
         """The same of what YAML holds; None for nothing."""
-        config: Self = _section(cls, {} if values is None else values, "")
+        config: Self = _section(cls, _on_base({} if values is None else values), "")
         return config
 
     def as_dict(self) -> dict[str, Json]:
@@ -445,6 +448,39 @@ class TrainConfig:
         """All fields as YAML, such that :meth:`from_yaml` gives an equal configuration."""
         text: str = yaml.safe_dump(self.as_dict(), sort_keys=False, allow_unicode=True)
         return text
+
+
+def _on_base(values: object) -> object:
+    """What YAML holds, on top of the packaged configuration that its key ``base`` names.
+
+    The fields of :data:`_MERGED` are taken one by one, every other value as a whole: half a network
+    or a list of places would be another one.
+    """
+    if not isinstance(values, Mapping) or "base" not in values:
+        return values
+    name, known = values["base"], packaged_configs()
+    if name not in known:
+        raise ValueError(f"base must be one of {', '.join(known)}, got {name!r}")
+    out = dict(_packaged(name))
+    for key, value in values.items():
+        if key in _MERGED and isinstance(value, Mapping):
+            out[key] = {**out.get(key, {}), **value}
+        elif key != "base":
+            out[key] = value
+    return out
+
+
+def packaged_configs() -> list[str]:
+    """Names of the configurations in ``train/configs``."""
+    files = resources.files("train").joinpath("configs").iterdir()
+    return sorted(Path(f.name).stem for f in files if f.name.endswith(".yaml"))
+
+
+def _packaged(name: str) -> JsonObject:
+    """What the YAML file of a packaged configuration holds, its base included."""
+    text = resources.files("train").joinpath("configs", f"{name}.yaml").read_text(encoding="utf-8")
+    values: Any = _on_base(yaml_values(text))
+    return dict(values)
 
 
 @checked
@@ -465,8 +501,7 @@ def load_config(path: str | Path) -> TrainConfig:
 @checked
 def packaged_config(name: str) -> TrainConfig:
     """A configuration of ``train/configs``, such as ``default`` or ``quick``."""
-    text = resources.files("train").joinpath("configs", f"{name}.yaml").read_text(encoding="utf-8")
-    return TrainConfig.from_yaml(text)
+    return TrainConfig.of(_packaged(name))
 
 
 @checked

@@ -99,6 +99,9 @@ def test_sections_from_plain_values():
         ("late: {scenes: {fat: 5}}", "late: scenes: fat must be 2 numbers"),
         ("looks: [0, 1]", "unknown key 'looks'"),
         ("objective: {looks: [0, 1], fidelities: [0, 1]}", "looks is the former name of fidelit"),
+        ("base: nosuch", "base must be one of default, long, quick, short, got 'nosuch'"),
+        ("base: [default]", "base must be one of"),
+        ("base: default\nlate: {begin: 0.5}", "unknown key 'late.begin'"),
         ("- 3", "mapping"),
         ("a: [", "not YAML"),
     ],
@@ -109,6 +112,26 @@ def test_bad_values_name_the_key(text, message, tmp_path):
     (tmp_path / "bad.yaml").write_text(text)
     with pytest.raises(ValueError, match=r"bad\.yaml"):
         load_config(tmp_path / "bad.yaml")
+
+
+def test_a_base_is_changed_key_by_key_in_its_sections_and_as_a_whole_elsewhere():
+    base = packaged_config("default")
+    changed = TrainConfig.from_yaml(
+        "base: default\nsteps: 100\ndata: {views: 246}\nnetwork: mylab.nets:Net\n"
+        "late: {scenes: {tilt: 10}}"
+    )
+    assert differences(base.as_dict(), changed.as_dict()) == sorted(
+        [
+            "steps",
+            "data.views",
+            "late.scenes.tilt",
+            "network.class",
+            *(f"network.{key}" for key in base.network),
+            *(f"late.scenes.{key}" for key in base.late.scenes),
+        ]
+    )
+    assert changed.network == {"class": "mylab.nets:Net"}
+    assert TrainConfig.from_yaml("base: default") == base
 
 
 def test_packaged():
