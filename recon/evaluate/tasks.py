@@ -115,7 +115,7 @@ def _task(values: object, name: str, folder: Path) -> Task:
     for key in ("scene", "signal", "inset"):
         if key not in values:
             raise ValueError(f"task {name} needs {key}; see torchpcct show-task plaque")
-    for key in ("name", "title", "background", "reference"):
+    for key in ("name", "background"):
         if not isinstance(values.get(key, ""), str) and (
             key != "name" or not _is_whole(values[key])
         ):
