@@ -243,13 +243,14 @@ class ObjectiveConfig:
     """Weights of the terms of :mod:`train.objective` and size of the validation.
 
     Args:
-        data: of eᵀH e.
+        data: of eᵀH e; 0: neither that nor ``white``.
         white: of ‖e‖², against ``data``; edge: by how much more within two voxels of an edge; body:
             in bodies and one voxel about them; flat: in bodies, where the truth is constant for
             two voxels around, such as deep in a lumen; flat_from: share of the training after
             which ``flat`` counts.
-        noise_free: of ``data`` and ``white`` of the same scene without noise, against those with
-            noise: what is left there is blur and overshoot.
+        relative: of ‖e‖² over that of the filtered view, with the same weights of places.
+        noise_free: of these of the same scene without noise, against those with noise: what is left
+            there is blur and overshoot.
         contrast: of the ROI contrasts' errors at fidelity 1; viewing: share of it that is left at
             fidelity 0, linear between.
         bias: κ at fidelity 0 and at fidelity 1, linear between.
@@ -267,6 +268,7 @@ class ObjectiveConfig:
     body: float = 0.0
     flat: float = 0.0
     flat_from: float = 0.0
+    relative: float = 0.0
     noise_free: float = 0.0
     contrast: float = 0.2
     viewing: float = 1.0
@@ -276,8 +278,19 @@ class ObjectiveConfig:
     held_out: int = 64
 
     def __post_init__(self) -> None:
-        for name in ("data", "white", "edge", "body", "flat", "noise_free", "contrast"):
+        for name in (
+            "data",
+            "white",
+            "edge",
+            "body",
+            "flat",
+            "relative",
+            "noise_free",
+            "contrast",
+        ):
             _set(self, **{name: number(name, getattr(self, name), low=0.0)})
+        if not self.data and not self.relative:
+            raise ValueError("data and relative are both 0: nothing is left of the image's error")
         _set(self, flat_from=number("flat_from", self.flat_from, low=0.0, high=1.0))
         _set(self, viewing=number("viewing", self.viewing, low=0.0, high=1.0))
         _set(self, contrast_sd=number("contrast_sd", self.contrast_sd, positive=True))

@@ -207,7 +207,9 @@ class Task:
         for field_name in ("title", "reference"):
             value = getattr(self, field_name)
             if not isinstance(value, str):
-                raise TypeError(f"task {self.name}: {field_name} must be a text, got {value!r:.200}")
+                raise TypeError(
+                    f"task {self.name}: {field_name} must be a text, got {value!r:.200}"
+                )
         check_method(self.reference)
         if split_energies(self.reference)[0].partition(":")[0] != "fbp" or "@" in self.reference:
             raise ValueError(

@@ -99,6 +99,7 @@ def test_sections_from_plain_values():
         ("late: {scenes: {fat: 5}}", "late: scenes: fat must be 2 numbers"),
         ("looks: [0, 1]", "unknown key 'looks'"),
         ("objective: {looks: [0, 1], fidelities: [0, 1]}", "looks is the former name of fidelit"),
+        ("objective: {data: 0}", "data and relative are both 0"),
         ("base: nosuch", "base must be one of default, long, quick, short, got 'nosuch'"),
         ("base: [default]", "base must be one of"),
         ("base: default\nlate: {begin: 0.5}", "unknown key 'late.begin'"),

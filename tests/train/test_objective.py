@@ -72,6 +72,28 @@ def test_terms_by_their_definitions(data):
     assert parts["white"] < more["white"] < 3 * parts["white"]
 
 
+def test_scenes_count_alike_by_their_relative_error(data):
+    """Twice the error of the filtered view costs four wherever it is, however large that is."""
+    batch = data.batch(0, 4, range(2))
+    truth, (_, _, smoothed) = truth_of(batch), batch.views
+    assert smoothed is not None
+    error = 2.0 * (smoothed[:4] - truth)
+    config = ObjectiveConfig(data=0.0, relative=3.0, contrast=0.0, edge=2.0, body=1.0, flat=1.0)
+    loss = Objective(config)(Given(truth + error), batch)
+    assert float(loss.total) == pytest.approx(2 * 3.0 * 4.0, rel=1e-4)
+    assert "data" not in loss.parts
+
+
+def test_without_a_filtered_view_the_step_towards_the_data_is_the_measure(data):
+    batch = data.batch(0, 4, range(2))
+    truth, (first, towards, _) = truth_of(batch), batch.views
+    config = ObjectiveConfig(data=0.0, relative=3.0, contrast=0.0)
+    bare = replace(batch, views=(first, towards, None))
+    loss = Objective(config)(Given(towards[:4].clone()), bare)
+    assert float(loss.total) == pytest.approx(2 * 3.0, rel=1e-4)
+    assert not torch.equal(towards[:4], truth)
+
+
 def test_noise_costs_once_and_bias_with_its_weight(data):
     """Contrast errors that are opposite in both draws are noise: κ d₁ d₂ gives back; equal ones
     are bias: it adds."""
