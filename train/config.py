@@ -42,6 +42,8 @@ _MOST_VOXELS = 1024
 """Voxels along an edge of the training inset at most."""
 _FASTEST = 10.0
 """Learning rate of Adam at most, which moves every weight by so much in a step."""
+_FOLDER = resources.files("train") / "configs"
+"""Of the packaged configurations."""
 _MERGED = ("data", "late", "objective")
 """Sections that a file with a ``base`` gives in part."""
 VALIDATED_AT_ONCE = 4
@@ -471,7 +473,7 @@ def _on_base(values: object) -> object:
     """
     if not isinstance(values, Mapping) or "base" not in values:
         return values
-    name, known = values["base"], packaged_configs()
+    name, known = values["base"], _packaged_names()
     if name not in known:
         raise ValueError(f"base must be one of {', '.join(known)}, got {name!r}")
     out = dict(_packaged(name))
@@ -483,15 +485,14 @@ def _on_base(values: object) -> object:
     return out
 
 
-def packaged_configs() -> list[str]:
+def _packaged_names() -> list[str]:
     """Names of the configurations in ``train/configs``."""
-    files = resources.files("train").joinpath("configs").iterdir()
-    return sorted(Path(f.name).stem for f in files if f.name.endswith(".yaml"))
+    return sorted(Path(f.name).stem for f in _FOLDER.iterdir() if f.name.endswith(".yaml"))
 
 
 def _packaged(name: str) -> JsonObject:
     """What the YAML file of a packaged configuration holds, its base included."""
-    text = resources.files("train").joinpath("configs", f"{name}.yaml").read_text(encoding="utf-8")
+    text = (_FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
     values: Any = _on_base(yaml_values(text))
     return dict(values)
 

@@ -9,10 +9,9 @@ with errors e₁, e₂ in noise units:
 * ``white``: ‖e‖² per voxel, for the frequencies that the scanner does not see; more on both sides
   of edges, where blur and undershoot are, and in bodies, which are small beside what surrounds
   them; more again deep in wide bodies, where no contrast can be lost and noise alone is left;
-* ``relative``: the same over that of the filtered view of the same data. Without it the errors of a
-  few scenes (high dose, calcifications) are hundreds of times those of the others and decide every
-  step; with it scenes count alike, and the network learns in a sixth of the steps
-  (``train/experiments.md``);
+* ``relative``: the same over that of the filtered view of the same data, so that scenes count
+  alike: their squared errors differ by far more than one power of ten, and the largest decide a
+  step. With it fewer steps are needed for the same error (``train/experiments.md``);
 * ``noise_free``: all of these of the same scene without noise, where all that is left is blur and
   overshoot beside edges;
 * ``contrast``: the errors d of ROI contrasts, small ones and that of a whole core, (d₁² + d₂²) / 2
@@ -49,7 +48,7 @@ _LEAST_ERROR = 1e-4
 """Mean squared error of a filtered view, in noise units, that counts at least: of what is nearly
 empty and without noise nothing is to be learned."""
 _TAME_CONTRAST = 2.0
-"""The same of errors of contrast."""
+"""Squared errors of contrast beyond count less than their size."""
 _NOISE_FREE_SHARE = 0.5
 """Share of the scenes that are seen without noise too; there that counts so many times more."""
 _LEAST_CONTRAST_HU = 10.0
