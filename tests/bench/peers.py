@@ -16,7 +16,6 @@ import importlib.util
 import json
 import os
 import pickle
-import subprocess
 import sys
 import tempfile
 import time
@@ -28,6 +27,7 @@ import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
+from processes import Process, answers
 from projectors import Case, _gaussians, _machine, astra_line, ours, xcist
 from results import write_results
 
@@ -337,14 +337,8 @@ def _error(found: np.ndarray, exact: np.ndarray) -> float:
 
 def serve(name: str, case: Case) -> None:
     """Answer the lines of the standard input, each the name of an operation, with its seconds."""
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # whatever a toolkit prints is no answer
+    answer = answers()
     toolkit = TOOLKITS[name](case)
-
-    def answer(value: Any) -> None:
-        answers.write(json.dumps(value) + "\n")
-        answers.flush()
-
     if toolkit is None:
         answer(None)
         return
@@ -368,36 +362,6 @@ def serve(name: str, case: Case) -> None:
         answer([(b - a) * toolkit.every for a, b in zip(begin, end, strict=True)])
 
 
-class Process:
-    """A toolkit at work on a case; ``operations`` is empty where it is not installed."""
-
-    def __init__(self, python: str, name: str, case: Path) -> None:
-        self._process = subprocess.Popen(
-            [python, __file__, "--worker", name, "--case", str(case)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        self.operations: list[str] = self._answer() or []
-
-    def _answer(self) -> Any:
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        return json.loads(line) if line else None
-
-    def ask(self, what: str) -> Any:
-        """Seconds (wall, processor) of an operation, or the ``errors``."""
-        assert self._process.stdin is not None
-        self._process.stdin.write(what + "\n")
-        self._process.stdin.flush()
-        return self._answer()
-
-    def close(self) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait()
-
-
 # --- all of them ----------------------------------------------------------------------------------
 
 
@@ -405,7 +369,11 @@ def measure(
     python: str, names: list[str], label: str, case: Path, rounds: int
 ) -> list[dict[str, Any]]:
     """One row for each toolkit and operation; ``case`` is the file of the case ``label``."""
-    processes = {name: Process(python, name, case) for name in names}
+
+    def begun(name: str) -> Process:
+        return Process(python, __file__, "--worker", name, "--case", case)
+
+    processes = {name: begun(name) for name in names}
     rows = []
     for name, process in processes.items():
         errors = process.ask("errors") if process.operations else {}
@@ -414,7 +382,7 @@ def measure(
             rows.append({**row, "error": (errors or {}).get(operation)})
     # The errors' calls have warmed some operations up: the first call is that of a new process.
     for row in rows:
-        fresh = Process(python, row["toolkit"], case)
+        fresh = begun(row["toolkit"])
         answer = fresh.ask(row["operation"])
         fresh.close()
         if answer is None:

@@ -17,9 +17,7 @@ processes take turns, and the seconds are those of whole calls: preparation, fir
 
 import argparse
 import datetime
-import json
 import os
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -28,6 +26,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from peers import mbirtorch_model
+from processes import Process, answers
 from projectors import _ellipses, _machine, line_integrals
 from results import write_results
 
@@ -214,21 +213,25 @@ def main() -> None:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     if options.worker:
-        answers = os.fdopen(os.dup(1), "w")
-        os.dup2(2, 1)  # whatever a toolkit prints is no answer
+        answer = answers()
         minimise = MINIMISERS[options.worker](Problem(options.size), options.neighbours)
         minimum = options.out / f"{options.worker}_{options.neighbours}_{options.size}.npy"
-        answers.write(json.dumps(list(curve(minimise, minimum))))
-        answers.close()
+        answer(["curve"])
+        for _ in sys.stdin:
+            answer(list(curve(minimise, minimum)))
         return
     runs: dict[tuple[str, int], list[list[list[float]]]] = {}
     for _ in range(options.rounds):
         for peer, neighbours in NEIGHBOURS.items():
             for name in ("torchpcct", peer):
-                call = [options.python, __file__, "--worker", name, "--size", str(options.size)]
-                call += ["--neighbours", str(neighbours), "--out", str(options.out)]
-                said = subprocess.run(call, stdout=subprocess.PIPE, text=True, check=True).stdout
-                runs.setdefault((name, neighbours), []).append(json.loads(said))
+                call = [__file__, "--worker", name, "--size", options.size]
+                call += ["--neighbours", neighbours, "--out", options.out]
+                process = Process(options.python, *call)
+                found = process.ask("curve") if process.operations else None
+                process.close()
+                if found is None:
+                    raise SystemExit(f"{name} ended: install it (see above), or read its words")
+                runs.setdefault((name, neighbours), []).append(found)
     minima = {
         (name, n): np.load(options.out / f"{name}_{n}_{options.size}.npy") for name, n in runs
     }
