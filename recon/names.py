@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib
 import re
 from collections.abc import Callable, Mapping
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,13 @@ _ENERGIES = re.compile(r"(?P<before>[:,])energies(?:=(?P<contrast>[^,@]*))?(?=,|
 
 _MBIR = ("weights", "network", "fidelity", "vessel", "tissues", "prior")
 """Options of MBIR in a method's name."""
+
+
+def packaged_names(folder: Traversable) -> tuple[str, ...]:
+    """Names of the YAML files in a folder of the package, without their ending."""
+    return tuple(
+        sorted(f.name.removesuffix(".yaml") for f in folder.iterdir() if f.name.endswith(".yaml"))
+    )
 
 
 def filter_name(text: str) -> str:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 import yaml
 
 from recon.mbir.network import NetworkConfig
-from recon.names import is_module_name
+from recon.names import is_module_name, packaged_names
 from torchpcct.formats.damage import read_yaml, yaml_values
 from torchpcct.validate import checked, number, numbers, whole
 from train.scenes.scene import SceneConfig
@@ -78,7 +78,8 @@ def _section(cls: type[C], values: object, where: str) -> C:
     for key in values:
         if key not in known:
             name = f"{where}.{key}" if where else str(key)
-            raise ValueError(f"unknown key {name!r}; known in {label}: {', '.join(known)}")
+            listed = ", ".join(known if where else ["base", *known])
+            raise ValueError(f"unknown key {name!r}; known in {label}: {listed}")
     needed = [f.name for f in fields(cls) if f.default is MISSING and f.default_factory is MISSING]
     missing = [name for name in needed if name not in values]
     if missing:
@@ -473,7 +474,7 @@ def _on_base(values: object) -> object:
     """
     if not isinstance(values, Mapping) or "base" not in values:
         return values
-    name, known = values["base"], _packaged_names()
+    name, known = values["base"], packaged_names(_FOLDER)
     if name not in known:
         raise ValueError(f"base must be one of {', '.join(known)}, got {name!r}")
     out = dict(_packaged(name))
@@ -483,11 +484,6 @@ def _on_base(values: object) -> object:
         elif key != "base":
             out[key] = value
     return out
-
-
-def _packaged_names() -> list[str]:
-    """Names of the configurations in ``train/configs``."""
-    return sorted(Path(f.name).stem for f in _FOLDER.iterdir() if f.name.endswith(".yaml"))
 
 
 def _packaged(name: str) -> JsonObject:

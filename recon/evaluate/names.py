@@ -16,6 +16,7 @@ from recon.names import (
     is_module_name,
     mbir_options,
     meant_method,
+    packaged_names,
     split_energies,
 )
 from torchpcct.validate import choice
@@ -24,9 +25,7 @@ __all__ = ["TASKS"]
 
 _FOLDER = resources.files("recon") / "evaluate" / "tasks"
 """Of the tasks that come with the package."""
-TASKS: tuple[str, ...] = tuple(
-    sorted(Path(str(p)).stem for p in _FOLDER.iterdir() if str(p).endswith(".yaml"))
-)
+TASKS = packaged_names(_FOLDER)
 """Names of the tasks that come with the package."""
 
 
