@@ -146,6 +146,9 @@ def _points(terms: int) -> NDArray[np.float64]:
 
 BAND_ENERGY = 1e-13
 """Bands along z whose energy is below this share of the kernel's are dropped (float32 rounding)."""
+IN_CACHE = 2**17
+"""Complex numbers that a core has at hand. Spectra of a batch in pieces of about so many are 1.7
+times as fast as at once, on both of two cores (12 volumes of 40 x 32 x 32 each)."""
 REFERENCE_FREQUENCY = 0.5
 """Usual frequency of `information`, line pairs per mm."""
 AROUND = 0.2
@@ -267,8 +270,18 @@ class Gram:
 
     def _apply(self, x: Tensor) -> Tensor:
         x3 = x.unsqueeze(-3) if self._flat else x
-        spectra = self._spectra.to(torch.complex128) if x.dtype == torch.float64 else self._spectra
-        basis = self._basis.to(x.dtype)
+        volumes = x3.reshape(-1, *x3.shape[-3:])
+        many = max(1, len(volumes))
+        if x.device.type == "cpu":
+            many = max(1, IN_CACHE // (x3.shape[-3] * math.prod(self.padded) // 2))
+        out = torch.cat([self._of_some(v) for v in volumes.split(many)]).reshape(x3.shape)
+        return out.squeeze(-3) if self._flat else out
+
+    def _of_some(self, x3: Tensor) -> Tensor:
+        """H of volumes ``(batch, z, y, x)``, all at once."""
+        double = x3.dtype == torch.float64
+        spectra = self._spectra.to(torch.complex128) if double else self._spectra
+        basis = self._basis.to(x3.dtype)
         plain = self._transform(x3)
         total = torch.zeros_like(plain)
         _banded_add(spectra[0], plain, self.factor, total)
@@ -278,8 +291,7 @@ class Gram:
             part = torch.zeros_like(plain)
             _banded_add(kernel, plain, 0.5 * self.factor, part)
             out = out + b * self._inverse(part)
-        out = out + self._inverse(total)
-        return out.squeeze(-3) if self._flat else out
+        return out + self._inverse(total)
 
     def _transform(self, x: Tensor) -> Tensor:
         """Zero-padded in-plane spectra."""
