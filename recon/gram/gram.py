@@ -278,7 +278,7 @@ class Gram:
         return out.squeeze(-3) if self._flat else out
 
     def _of_some(self, x3: Tensor) -> Tensor:
-        """H of volumes ``(batch, z, y, x)``, all at once."""
+        """G x of volumes ``(batch, z, y, x)``, all at once."""
         double = x3.dtype == torch.float64
         spectra = self._spectra.to(torch.complex128) if double else self._spectra
         basis = self._basis.to(x3.dtype)
