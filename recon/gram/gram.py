@@ -273,7 +273,8 @@ class Gram:
         volumes = x3.reshape(-1, *x3.shape[-3:])
         many = max(1, len(volumes))
         if x.device.type == "cpu":
-            many = max(1, IN_CACHE // (x3.shape[-3] * math.prod(self.padded) // 2))
+            py, px = self.padded
+            many = max(1, IN_CACHE // (x3.shape[-3] * py * (px // 2 + 1)))
         out = torch.cat([self._of_some(v) for v in volumes.split(many)]).reshape(x3.shape)
         return out.squeeze(-3) if self._flat else out
 
