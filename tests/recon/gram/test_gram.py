@@ -136,6 +136,16 @@ def test_scaled_batched_and_differentiable(inset):
     assert gram.apply(x.double()).dtype == torch.float64
 
 
+def test_batches_in_pieces_as_at_once(inset, monkeypatch):
+    A, _, gram = inset
+    x = torch.randn(5, *A.domain_shape, generator=torch.Generator().manual_seed(2))
+    found = []
+    for numbers in (1, 2**30):
+        monkeypatch.setattr("recon.gram.gram.IN_CACHE", numbers)
+        found.append(gram.apply(x))
+    torch.testing.assert_close(*found, rtol=1e-5, atol=1e-6 * float(found[0].abs().max()))
+
+
 def test_information_follows_exposure_not_voxel_size(inset):
     _, _, gram = inset
     assert gram.scaled(2.0).information(HU) == pytest.approx(2 * gram.information(HU))
