@@ -32,12 +32,11 @@ import torch
 from numpy.lib.format import open_memmap
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional as F
 
 from recon.data_term import Quadratic
 from recon.least_squares.inset_problem import InsetProblem
 from recon.mbir.unrolled import Views as NetworkViews
-from recon.mbir.unrolled import first_views
+from recon.mbir.unrolled import first_views, largest_nearby
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.files import atomic_write
 from torchpcct.geometry import VolumeGrid
@@ -66,6 +65,8 @@ BODY_HU = 15.0
 edge."""
 FORMAT = "torchpcct training views 1"
 """What kept views say of themselves."""
+_REACH = 2
+"""Voxels about one in which the truth is constant, or an edge."""
 _DRAWS_OF_ROI = 6
 """Random numbers that a small ROI takes."""
 _SIGNAL = 1
@@ -477,15 +478,17 @@ def painted(config: DataConfig, seed: int) -> tuple[Tensor, Tensor, Tensor]:
 
 def _bodies(truth: Tensor) -> Tensor:
     """Bodies and one voxel about them, of ``(z, y, x)``."""
-    return F.max_pool3d((truth.abs() > BODY_HU).float()[None, None], 3, 1, 1)[0, 0] > 0
+    return largest_nearby(truth.abs(), 1) > BODY_HU
 
 
 def _edges(truth: Tensor) -> Tensor:
-    """Where values of the cube of five voxels about a voxel differ by more than that of a body."""
-    both = torch.stack([truth, -truth])[None]
-    for size in ((1, 1, 5), (1, 5, 1), (5, 1, 1)):
-        both = F.max_pool3d(both, size, 1, [n // 2 for n in size])
-    return both[0].sum(0) > BODY_HU
+    """Where values about a voxel differ by more than that of a body, of ``(z, y, x)``."""
+    return spread(truth) > BODY_HU
+
+
+def spread(truth: Tensor) -> Tensor:
+    """Highest less lowest value in the cube of five voxels about each, of ``(..., z, y, x)``."""
+    return largest_nearby(truth, _REACH) + largest_nearby(-truth, _REACH)
 
 
 def situation_term(situation: Situation, config: DataConfig) -> Quadratic:

@@ -37,9 +37,9 @@ from torch import Tensor, nn
 from recon.data_term import Quadratic
 from recon.mbir.network import bilateral_prior
 from recon.mbir.priors import Prior
-from recon.mbir.unrolled import DEFAULT_FIDELITY, Views, largest_nearby
+from recon.mbir.unrolled import DEFAULT_FIDELITY, Views
 from train.config import VALIDATED_AT_ONCE, ObjectiveConfig
-from train.data import Batch, Data
+from train.data import Batch, Data, spread
 
 _TAME_ERROR = 0.02
 """Squared errors beyond count less than their size: a few scenes (calcifications at high dose)
@@ -53,10 +53,8 @@ _NOISE_FREE_SHARE = 0.5
 """Share of the scenes that are seen without noise too; there that counts so many times more."""
 _LEAST_CONTRAST_HU = 10.0
 """Contrasts below are none: what is read there is invented."""
-_FLAT_REACH = 2
-"""Voxels of 0.2 mm about one within which the truth must be constant."""
 _FLAT_HU = 10.0
-"""Range of the truth, in HU, that is called constant."""
+"""Spread of the truth about a voxel, in HU, that is called constant."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +133,7 @@ class Objective:
         error = made - truth
         places = c.edge * batch.edges + c.body * batch.bodies
         if c.flat and progress >= c.flat_from:
-            places = places + c.flat * batch.bodies * _flat(batch.truth)
+            places = places + c.flat * batch.bodies * (spread(batch.truth) < _FLAT_HU)
         counts = 1.0 + places[scene]
         white = (error.square() * counts).mean(dim=(1, 2, 3))
         image, data = torch.zeros_like(white), None
@@ -248,9 +246,3 @@ class Objective:
                 float(np.abs(of["read"])[has & ~real].mean()) if (has & ~real).any() else 0.0
             )
         return Validation(score, figures, pictures)
-
-
-def _flat(truth: Tensor) -> Tensor:
-    """1 where the truth is constant for two voxels around, else 0; ``(size, z, y, x)``."""
-    spread = largest_nearby(truth, _FLAT_REACH) + largest_nearby(-truth, _FLAT_REACH)
-    return (spread < _FLAT_HU).to(truth.dtype)
