@@ -269,6 +269,8 @@ class Gram:
     __call__ = apply
 
     def _apply(self, x: Tensor) -> Tensor:
+        if not x.numel():
+            return torch.zeros_like(x)  # the Fourier transform takes no empty batch
         x3 = x.unsqueeze(-3) if self._flat else x
         volumes = x3.reshape(-1, *x3.shape[-3:])
         many = max(1, len(volumes))
@@ -386,6 +388,9 @@ class Gram:
         if self._factor is None:
             self._factor = cholesky(self._of_noise)[0]
         nz, (ny, nx) = white.shape[-3], self.grid.shape[-2:]
+        if not white.numel():
+            out = white[..., :ny, :nx]
+            return out.squeeze(-3) if self._flat else out
         spectrum = torch.fft.rfft2(white)
         lower = self._factor
         mixed = torch.zeros_like(spectrum)

@@ -314,7 +314,7 @@ def limited(u: Tensor, smoothed: Tensor, noise: Tensor) -> Tensor:
 
 
 def largest_nearby(v: Tensor, reach: int) -> Tensor:
-    """The largest value within ``reach`` voxels along each axis of ``v`` ``(batch, z, y, x)``; only
+    """The largest value within ``reach`` voxels along each axis of ``v`` ``(..., z, y, x)``; only
     voxels of the volume count.
 
     Maxima over 2, 4 and 8 neighbours, each of two of those before: on a CPU 30 times as fast as

@@ -146,6 +146,17 @@ def test_batches_in_pieces_as_at_once(inset, monkeypatch):
     torch.testing.assert_close(*found, rtol=1e-5, atol=1e-6 * float(found[0].abs().max()))
 
 
+def test_an_empty_batch_gives_an_empty_batch(inset):
+    A, _, gram = inset
+    nothing = torch.zeros(0, 2, *A.domain_shape, requires_grad=True)
+    found = gram.apply(nothing)
+    assert found.shape == nothing.shape
+    found.sum().backward()
+    assert nothing.grad.shape == nothing.shape
+    empty = gram.noise((0,), generator=torch.Generator())
+    assert empty.shape == (0, *A.domain_shape)
+
+
 def test_information_follows_exposure_not_voxel_size(inset):
     _, _, gram = inset
     assert gram.scaled(2.0).information(HU) == pytest.approx(2 * gram.information(HU))
