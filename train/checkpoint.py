@@ -17,7 +17,7 @@ from torchpcct.files import LEFTOVER
 if TYPE_CHECKING:
     from torchpcct.typing import JsonObject
 
-CHECKPOINT_FORMAT = "torchpcct training checkpoint 2"
+CHECKPOINT_FORMAT = "torchpcct training checkpoint 3"
 """What a checkpoint says of itself."""
 UNFINISHED = "checkpoint.next.safetensors"
 """Name of a checkpoint that is being written."""

@@ -41,11 +41,13 @@ _HIGHEST = {"seed": 2**62, "unroll": 1000}
 _MOST_VOXELS = 1024
 """Voxels along an edge of the training inset at most."""
 _FASTEST = 10.0
-"""Learning rate of Adam at most, which moves every weight by so much in a step."""
+"""Learning rate at most: about what a weight moves in a step."""
 _FOLDER = resources.files("train") / "configs"
 """Of the packaged configurations."""
 _MERGED = ("data", "late", "objective")
 """Sections that a file with a ``base`` gives in part."""
+OPTIMISERS = ("adam", "soap")
+"""Names of the optimisers."""
 VALIDATED_AT_ONCE = 4
 """Scenes that a validation reconstructs at a time."""
 
@@ -320,7 +322,8 @@ class TrainConfig:
         seed: of the weights' start, the data and the validation, ≥ 0.
         steps: optimisation steps.
         batch: scenes of a step, over all processes.
-        learning_rate: of Adam, at the end of the warm-up.
+        optimiser: "adam", or "soap" (:mod:`train.soap`), which needs a tenth of the steps.
+        learning_rate: of the optimiser, at the end of the warm-up.
         warmup: steps over which it rises linearly; it counts only steps that change the weights, as
             the average does.
         decay: share of the steps, at the end, over which the learning rate falls along a cosine;
@@ -352,6 +355,7 @@ class TrainConfig:
     seed: int = 0
     steps: int = 3000
     batch: int = 4
+    optimiser: str = "adam"
     learning_rate: float = 2e-3
     warmup: int = 50
     decay: float = 1.0
@@ -395,6 +399,8 @@ class TrainConfig:
             late=_section(LateConfig, self.late, "late"),
             objective=_section(ObjectiveConfig, self.objective, "objective"),
         )
+        if self.optimiser not in OPTIMISERS:
+            raise ValueError(f"optimiser must be {' or '.join(OPTIMISERS)}, got {self.optimiser!r}")
         if self.ema >= 1:
             raise ValueError(f"ema must be less than 1, got {self.ema:g}")
         _set(self, single=number("single", self.single, low=0.0, high=1.0))

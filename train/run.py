@@ -1,8 +1,8 @@
 """A run in one process: its state, and what is done with it: resume, step, validate, save, export
 with a record.
 
-Adam, the average of the weights and the learning rate count updates: steps less those that were
-skipped. The learning rate is a closed form in that number, the other two keep all they know in
+The optimiser, the average of the weights and the learning rate count updates: steps less those that
+were skipped. The learning rate is a closed form in that number, the other two keep all they know in
 tensors, so a checkpoint restores their bits.
 """
 
@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import safetensors
 import torch
 from torch import Tensor, nn
-from torch.optim import Adam
+from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel
 
@@ -36,6 +36,7 @@ from train.data import Data, seed_of
 from train.logs import Logs
 from train.objective import Objective
 from train.processes import Group
+from train.soap import Soap
 
 if TYPE_CHECKING:
     from torchpcct.typing import JsonObject
@@ -94,6 +95,16 @@ def rate_factor(config: TrainConfig, update: int) -> float:
     )
 
 
+def _optimiser(config: TrainConfig, model: nn.Module) -> Optimizer:
+    rate = config.learning_rate
+    groups = [{"params": model.parameters(), "initial_lr": rate}]
+    return (
+        Soap(groups, lr=rate)
+        if config.optimiser == "soap"
+        else Adam(groups, lr=rate, betas=(0.9, 0.99))
+    )
+
+
 def _averaged(model: nn.Module, ema: float) -> AveragedModel:
     """Moving average of parameters and buffers; it starts at the weights of now."""
 
@@ -133,10 +144,7 @@ class Run:
         self.state = State()
         self.average = _averaged(model, config.ema)
         self.best: dict[str, Tensor] = {}
-        rate = config.learning_rate
-        self.adam = Adam(
-            [{"params": model.parameters(), "initial_lr": rate}], lr=rate, betas=(0.9, 0.99)
-        )
+        self.optimiser = _optimiser(config, model)
         self.logs: Logs | None = None
         self.notes: list[str] = []
         self._begun = self._saved = time.monotonic()
@@ -174,7 +182,7 @@ class Run:
                 part.write_text(self.config.to_yaml(), encoding="utf-8")
         done = state.step - state.skipped
         self.rate = LambdaLR(
-            self.adam, lambda update: rate_factor(self.config, update), last_epoch=done - 1
+            self.optimiser, lambda update: rate_factor(self.config, update), last_epoch=done - 1
         )
         state.machine = machine
         state.sessions.append({"command": command, "first_step": state.step})
@@ -197,14 +205,14 @@ class Run:
                 f"the run in {self.out} has another configuration ({', '.join(sorted(other))}): "
                 "resume it unchanged, or start a new run from its weights"
             )
-        moments: dict[int, dict[str, Tensor]] = {}
-        for key, value in _part(tensors, "adam").items():
+        known: dict[int, dict[str, Tensor]] = {}
+        for key, value in _part(tensors, "optimiser").items():
             index, name = key.split(".")
-            moments.setdefault(int(index), {})[name] = value
+            known.setdefault(int(index), {})[name] = value
         try:
             self.model.load_state_dict(_part(tensors, "model"))
             self.average.load_state_dict(_part(tensors, "average"))
-            self.adam.load_state_dict({**self.adam.state_dict(), "state": moments})
+            self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": known})
         except (RuntimeError, KeyError, ValueError) as error:
             raise TensorFileError(
                 f"the checkpoint in {self.out} belongs to another model: {error}"
@@ -223,7 +231,7 @@ class Run:
         rate = float(self.rate.get_last_lr()[0])
         norm = float(nn.utils.clip_grad_norm_(self.model.parameters(), config.clip))
         if math.isfinite(norm):
-            self.adam.step()
+            self.optimiser.step()
             self.rate.step()
             self.average.update_parameters(self.model)
             state.bad = 0
@@ -296,14 +304,16 @@ class Run:
         if self.logs is not None:
             self.logs.sync()
         self._tick()
-        adam = {
-            f"{i}.{k}": v for i, s in self.adam.state_dict()["state"].items() for k, v in s.items()
+        known = {
+            f"{i}.{k}": v
+            for i, s in self.optimiser.state_dict()["state"].items()
+            for k, v in s.items()
         }
         parts = {
             "model": self.model.state_dict(),
             "average": self.average.state_dict(),
             "best": self.best,
-            "adam": adam,
+            "optimiser": known,
         }
         tensors = {f"{part}.{k}": v for part, values in parts.items() for k, v in values.items()}
         self.store.save(tensors, {"config": self.config.to_yaml(), "state": vars(self.state)})

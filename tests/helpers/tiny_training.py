@@ -140,7 +140,7 @@ def assert_same_run(first, second):
     """Everything but times and command lines is the same, to the bit."""
     a, meta_a = read_tensors(first / "checkpoint.safetensors", CHECKPOINT_FORMAT)
     b, meta_b = read_tensors(second / "checkpoint.safetensors", CHECKPOINT_FORMAT)
-    assert {k.split(".")[0] for k in a} == {"model", "average", "best", "adam"}
+    assert {k.split(".")[0] for k in a} == {"model", "average", "best", "optimiser"}
     assert_same_tensors(a, b)
     for meta in (meta_a, meta_b):
         for key in ("seconds", "sessions"):
