@@ -208,7 +208,9 @@ class Run:
         known: dict[int, dict[str, Tensor]] = {}
         for key, value in _part(tensors, "optimiser").items():
             index, name = key.split(".")
-            known.setdefault(int(index), {})[name] = value
+            # Copied to where torch puts tensors: products of those that begin elsewhere have other
+            # last digits.
+            known.setdefault(int(index), {})[name] = value.clone()
         try:
             self.model.load_state_dict(_part(tensors, "model"))
             self.average.load_state_dict(_part(tensors, "average"))

@@ -92,7 +92,7 @@ class Soap(Optimizer):
 
 def _by_axes(gradient: Tensor) -> Tensor:
     """The places of a kernel as one axis, ``(outputs, inputs, places)``."""
-    return gradient.flatten(2) if gradient.dim() > 3 else gradient
+    return (gradient.flatten(2) if gradient.dim() > 3 else gradient).contiguous()
 
 
 def _turned(gradient: Tensor) -> list[int]:
@@ -108,7 +108,8 @@ def _refine(state: dict[str, Tensor], axis: int) -> None:
     sizes = (basis * (covariance @ basis)).sum(0)
     order = sizes.argsort(descending=True, stable=True)
     state["square"] = state["square"].index_select(axis, order)
-    state[f"basis_{axis}"] = torch.linalg.qr(covariance @ basis[:, order]).Q
+    # In the order in which a checkpoint keeps it: products with another have other last digits.
+    state[f"basis_{axis}"] = torch.linalg.qr(covariance @ basis[:, order]).Q.contiguous()
 
 
 def _along(values: Tensor, bases: dict[int, Tensor]) -> Tensor:

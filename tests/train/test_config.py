@@ -32,6 +32,8 @@ def test_sections_from_plain_values():
     ("text", "message"),
     [
         ("stepps: 3", "unknown key 'stepps'"),
+        ("optimiser: lion", "optimiser must be adam or soap, got 'lion'"),
+        ("optimiser: [soap]", r"optimiser must be adam or soap, got \['soap'\]"),
         ("network: {channels: [4, 6, 8], filters: 3}", r"unknown key 'network\.filters'"),
         ("data: {nonsense: 1}", r"unknown key 'data\.nonsense'"),
         ("data: {scenes: {nonsense: 1}}", r"data: unknown key 'scenes\.nonsense'"),

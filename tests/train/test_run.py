@@ -51,6 +51,21 @@ def test_resumed_run_is_bit_for_bit_the_uninterrupted_one(tmp_path, uninterrupte
     assert_same_run(tmp_path / "x", uninterrupted)
 
 
+def test_run_with_soap_is_resumed_bit_for_bit(tmp_path):
+    """Its bases are part of the checkpoint."""
+    config = stub_config(optimiser="soap")
+    run(tmp_path / "x", config)
+    run(tmp_path / "y", config, objective=StubObjective({4: send(signal.SIGTERM)}))
+    assert run(tmp_path / "y", config, resume=True)[0].step == STEPS
+    assert_same_run(tmp_path / "x", tmp_path / "y")
+
+
+def test_run_of_one_optimiser_is_not_resumed_with_another(tmp_path):
+    run(tmp_path / "x", objective=StubObjective({4: send(signal.SIGTERM)}))
+    with pytest.raises(ValueError, match=r"another configuration \(optimiser\)"):
+        run(tmp_path / "x", stub_config(optimiser="soap"), resume=True)
+
+
 def test_finished_run_resumed_changes_nothing(tmp_path, uninterrupted):
     run(tmp_path / "x")
     objective = StubObjective()
