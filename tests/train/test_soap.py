@@ -108,3 +108,29 @@ def test_gradients_of_zero_move_nothing(shape):
     zero = torch.zeros(shape, dtype=torch.float64)
     found = _steps(lambda p: Soap(p, RATE), [zero] * 25, zero + 1)
     assert torch.equal(found, zero + 1)
+
+
+def test_a_copy_of_the_state_goes_on_with_the_same_bits():
+    """As a checkpoint keeps it, of a kernel in the layout that processors convolve fastest in."""
+    gradients = [
+        _random(6, 5, 3, 3, 3, seed=k).float().to(memory_format=torch.channels_last_3d)
+        for k in range(2 * soap.REFRESHED_EVERY)
+    ]
+
+    def kernel(values):
+        return nn.Parameter(values.clone(memory_format=torch.channels_last_3d))
+
+    p = kernel(torch.ones(6, 5, 3, 3, 3))
+    optimiser = Soap([p], RATE)
+    for k, g in enumerate(gradients):
+        p.grad = g
+        optimiser.step()
+        if k == soap.REFRESHED_EVERY + 2:
+            q = kernel(p.detach())
+            other = Soap([q], RATE)
+            known = {name: value.contiguous().clone() for name, value in optimiser.state[p].items()}
+            other.load_state_dict({**other.state_dict(), "state": {0: known}})
+    for g in gradients[soap.REFRESHED_EVERY + 3 :]:
+        q.grad = g
+        other.step()
+    assert torch.equal(p, q)
