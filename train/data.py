@@ -35,8 +35,9 @@ from torch import Tensor
 
 from recon.data_term import Quadratic
 from recon.least_squares.inset_problem import InsetProblem
+from recon.mbir.network import largest_nearby
 from recon.mbir.unrolled import Views as NetworkViews
-from recon.mbir.unrolled import first_views, largest_nearby
+from recon.mbir.unrolled import first_views
 from torchpcct.acquisition.acquire import acquire
 from torchpcct.files import atomic_write
 from torchpcct.geometry import VolumeGrid

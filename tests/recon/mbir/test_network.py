@@ -1,5 +1,6 @@
 """The network: homogeneous, blind to nothing that it should see, any shape."""
 
+import itertools
 from dataclasses import replace
 from functools import partial
 
@@ -7,7 +8,14 @@ import pytest
 import torch
 from refusals import refusals
 
-from recon.mbir.network import Network, NetworkConfig, from_blocks, local_mean, to_blocks
+from recon.mbir.network import (
+    Network,
+    NetworkConfig,
+    from_blocks,
+    largest_nearby,
+    local_mean,
+    to_blocks,
+)
 
 SMALL = NetworkConfig((6, 8, 8), 0.4)
 
@@ -106,6 +114,8 @@ test_refusals = refusals(
     ("local_mm", lambda: NetworkConfig(local_mm=-1.0)),
     ("local_mm", lambda: NetworkConfig(local_mm="a")),
     ("turns", lambda: NetworkConfig(turns=1)),
+    ("extremes", lambda: NetworkConfig(bilateral=True, gate=True, extremes=1)),
+    ("set gate", lambda: NetworkConfig(bilateral=True, extremes=True)),
 )
 
 
@@ -181,3 +191,60 @@ def test_gradients_of_the_local_mean_under_autocast():
     plain = gradient()
     with torch.autocast("cpu", torch.bfloat16):
         torch.testing.assert_close(gradient(), plain)
+
+
+@pytest.mark.parametrize("reach", [1, 2, 5])
+@pytest.mark.parametrize("shape", [(1, 1, 1), (3, 8, 5), (12, 2, 9)])
+def test_largest_nearby_by_hand(reach, shape):
+    v = torch.randn(2, *shape, generator=torch.Generator().manual_seed(5))
+    found = largest_nearby(v, reach)
+    for at in itertools.product(*(range(n) for n in shape)):
+        near = tuple(slice(max(i - reach, 0), i + reach + 1) for i in at)
+        assert torch.equal(found[(slice(None), *at)], v[(slice(None), *near)].flatten(1).amax(1))
+
+
+def with_extremes():
+    """Random weights, but for the last layer: it gives nothing of its own, and equal weights."""
+    torch.manual_seed(0)
+    config = replace(SMALL, bilateral=True, gate=True, extremes=True, local_mm=1.6, turns=True)
+    made = Network(config).double().requires_grad_(False).eval()
+    made.leave.weight.zero_()
+    return made
+
+
+def test_extremes_are_views_that_the_gate_takes():
+    """With equal weights of the four choices the result is their mean: nothing (the local mean),
+    the filtered view, its highest and its lowest value nearby."""
+    network = with_extremes()
+    (u, towards), (filtered, _) = volumes(), volumes(seed=1)
+    level = local_mean(u, 1.6 / SMALL.voxel_mm)
+    high, low = largest_nearby(filtered, 1), -largest_nearby(-filtered, 1)
+    torch.testing.assert_close(
+        network(u, towards, CONDITION, filtered), (level + filtered + high + low) / 4
+    )
+
+
+def test_with_extremes_units_turns_and_constants_are_kept():
+    network = with_extremes()
+    network.leave.weight.normal_(0.0, 0.2, generator=torch.Generator().manual_seed(3))
+    u, towards = volumes((2, 8, 8, 8))
+    filtered = volumes((2, 8, 8, 8), seed=1)[0]
+    found = network(u, towards, CONDITION, filtered)
+    scaled = network(1e6 * u, 1e6 * towards, CONDITION, 1e6 * filtered)
+    more = network(2e6 * u, 2e6 * towards, CONDITION, 2e6 * filtered)
+    torch.testing.assert_close(more, 2 * scaled, rtol=1e-4, atol=1.0)
+    moved = network(u + 7.0, towards + 7.0, CONDITION, filtered + 7.0)
+    torch.testing.assert_close(moved, found + 7.0)
+    turned = [torch.rot90(v, 1, (-2, -1)) for v in (u, towards, filtered)]
+    torch.testing.assert_close(
+        network(turned[0], turned[1], CONDITION, turned[2]), torch.rot90(found, 1, (-2, -1))
+    )
+
+
+def test_every_weight_of_a_network_with_extremes_learns():
+    network = with_extremes()
+    network.leave.weight.normal_(0.0, 0.2, generator=torch.Generator().manual_seed(3))
+    network.requires_grad_(True).train()
+    u, towards = volumes()
+    network(u, towards, CONDITION, volumes(seed=1)[0]).square().sum().backward()
+    assert all(p.grad.abs().amax() > 0 for p in network.parameters())
