@@ -322,7 +322,7 @@ class TrainConfig:
         seed: of the weights' start, the data and the validation, ≥ 0.
         steps: optimisation steps.
         batch: scenes of a step, over all processes.
-        optimiser: "adam", or "soap" (:mod:`train.soap`), which needs a tenth of the steps.
+        optimiser: "adam", or "soap" (:mod:`train.soap`).
         learning_rate: of the optimiser, at the end of the warm-up.
         warmup: steps over which it rises linearly; it counts only steps that change the weights, as
             the average does.

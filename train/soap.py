@@ -7,12 +7,12 @@ ones. So the gradient of a layer is seen in a basis in which its entries are har
 of its covariances along each of its axes, and Adam works there.
 
 A kernel of a convolution has three axes, outputs, inputs and places: the largest covariance of the
-packaged network is 40 x 40, and a step costs 3 % more than one of Adam.
+packaged networks is 40 x 40, and a step of theirs takes 13 ms on one core of a CPU.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -28,8 +28,7 @@ SQUARE_DECAY = 0.995
 REFRESHED_EVERY = 10
 """Steps from one refinement of the basis to the next."""
 LARGEST_AXIS = 1024
-"""Axes with more entries keep their own basis: a covariance of theirs would cost more than the
-rest of a step."""
+"""Axes with more entries keep their own basis: the cost of another grows with their cube."""
 _LEAST = 1e-8
 """Added to the root of the mean square."""
 
@@ -46,22 +45,13 @@ class Soap(Optimizer):
         super().__init__(params, {"lr": lr})
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
-        """Change the tensors that have a gradient.
-
-        Args:
-            closure: computes loss and gradients anew, where they are not there yet.
-        """
-        loss = None
-        if closure is not None:
-            with torch.enable_grad():
-                loss = closure()
+    def step(self) -> None:  # type: ignore[override]
+        """Change the tensors that have a gradient."""
         for group in self.param_groups:
             for p in group["params"]:
                 if p.grad is not None:
                     direction = self._direction(p, _by_axes(p.grad))
                     p.add_(direction.reshape(p.shape), alpha=-group["lr"])
-        return loss
 
     def _direction(self, p: Tensor, gradient: Tensor) -> Tensor:
         """What a learning rate of 1 would take off ``p``, in the shape of ``gradient``."""
