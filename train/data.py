@@ -35,7 +35,7 @@ from torch import Tensor
 
 from recon.data_term import Quadratic
 from recon.least_squares.inset_problem import InsetProblem
-from recon.mbir.network import largest_nearby
+from recon.mbir.network import extremes_nearby, largest_nearby
 from recon.mbir.unrolled import Views as NetworkViews
 from recon.mbir.unrolled import first_views
 from torchpcct.acquisition.acquire import acquire
@@ -489,7 +489,8 @@ def _edges(truth: Tensor) -> Tensor:
 
 def spread(truth: Tensor) -> Tensor:
     """Highest less lowest value in the cube of five voxels about each, of ``(..., z, y, x)``."""
-    return largest_nearby(truth, _REACH) + largest_nearby(-truth, _REACH)
+    highest, lowest = extremes_nearby(truth, _REACH)
+    return highest - lowest
 
 
 def situation_term(situation: Situation, config: DataConfig) -> Quadratic:

@@ -273,7 +273,7 @@ class Gram:
             return torch.zeros_like(x)  # the Fourier transform takes no empty batch
         x3 = x.unsqueeze(-3) if self._flat else x
         volumes = x3.reshape(-1, *x3.shape[-3:])
-        many = max(1, len(volumes))
+        many = len(volumes)
         if x.device.type == "cpu":
             py, px = self.padded
             many = max(1, IN_CACHE // (x3.shape[-3] * py * (px // 2 + 1)))

@@ -167,7 +167,7 @@ class Network(nn.Module):
                 )
             views.append(smoothed)
             if self.config.extremes:
-                views += [largest_nearby(smoothed, 1), -largest_nearby(-smoothed, 1)]
+                views += extremes_nearby(smoothed, 1)
         if not self.config.local_mm:
             return self._symmetric(views, condition, mirrored)
         level = local_mean(estimate, self.config.local_mm / self.config.voxel_mm)
@@ -206,9 +206,11 @@ class Network(nn.Module):
             for part in out.to(x.dtype).split(_BLOCK**3, dim=1)
         ]
         made = volumes[0]
-        shares = [self.share] if self.config.bilateral and not self.config.gate else []
-        for share, view in zip(shares or _shares(volumes[1:]), views[2:], strict=False):
-            made = made + share * view
+        if self.config.bilateral:
+            # The last weight is that of none of the views.
+            shares = _shares(volumes[1:])[:-1] if self.config.gate else [self.share]
+            for share, view in zip(shares, views[2:], strict=True):
+                made = made + share * view
         return made
 
 
@@ -289,6 +291,11 @@ def largest_nearby(v: Tensor, reach: int) -> Tensor:
             v = torch.maximum(v.narrow(axis, 0, left), v.narrow(axis, step, left))
             width += step
     return v
+
+
+def extremes_nearby(v: Tensor, reach: int) -> tuple[Tensor, Tensor]:
+    """The largest and the smallest value nearby, as :func:`largest_nearby`."""
+    return largest_nearby(v, reach), -largest_nearby(-v, reach)
 
 
 def _turn(

@@ -41,7 +41,7 @@ from recon.mbir.network import (
     Network,
     NetworkConfig,
     edge_preserved,
-    largest_nearby,
+    extremes_nearby,
 )
 from recon.mbir.priors import PlugAndPlay, Prior, prior_of, same_kind
 from recon.mbir.residual import significant_residual
@@ -308,7 +308,7 @@ def limited(u: Tensor, smoothed: Tensor, noise: Tensor) -> Tensor:
         smoothed: :func:`recon.mbir.network.edge_preserved` of the same data.
         noise: ``(batch,)``, :func:`guide_noise`.
     """
-    high, low = largest_nearby(smoothed, _NEARBY), -largest_nearby(-smoothed, _NEARBY)
+    high, low = extremes_nearby(smoothed, _NEARBY)
     slack = (_EDGE * noise.reshape(-1, 1, 1, 1) - (high - low)).clamp_min(0.0)
     return torch.minimum(torch.maximum(u, low - slack), high + slack)
 
