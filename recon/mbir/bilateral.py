@@ -22,6 +22,7 @@ import torch
 from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional as F
 
 from torchpcct.devices import require_triton
 from torchpcct.threads import run
@@ -29,6 +30,8 @@ from torchpcct.validate import number, shaped, whole
 
 _LEAST = 1e-12
 """Of a threshold: its square is a float32 still."""
+_AT_ONCE = 16
+"""float32 that a processor computes at once at most."""
 
 
 @cache
@@ -42,61 +45,83 @@ def _offsets(reach: float, step: int) -> tuple[NDArray[np.int64], NDArray[np.flo
     return at[kept].astype(np.int64), np.exp(-0.5 * square[kept] / reach**2).astype(np.float32)
 
 
+def _padded(v: Tensor, beyond: int, fill: float = 0.0) -> NDArray[np.float32]:
+    """Rows of ``(batch, z, y, x)`` with ``beyond`` voxels more at both ends, and filled up to a
+    multiple of what a processor computes at once: then every neighbour along a row exists, and no
+    row has a rest that is computed number by number, which took five sixths of the time."""
+    return F.pad(v, (beyond, beyond + -v.shape[-1] % _AT_ONCE), value=fill).numpy()
+
+
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _forward(begin, end, u, g, scale, offsets, weights, out, total):
-    """Rows (batch · z · y) ``begin … end``: the filtered volume and the sums of weights."""
-    nz, ny, nx = u.shape[1:]
+def _forward(begin, end, u, g, scale, offsets, weights, beyond, out, total):
+    """Rows (batch · z · y) ``begin … end``: the filtered volume and the sums of weights.
+
+    u and g have ``beyond`` voxels more at both ends of their rows than out and total.
+    """
+    nz, ny, nx = out.shape[1:]
     for row in range(begin, end):
         b, z, y = row // (nz * ny), row // ny % nz, row % ny
         quarter = np.float32(0.25) * scale[b] * scale[b]
-        here, mine = g[b, z, y], u[b, z, y]
+        g0, u0 = g[b, z, y, beyond : beyond + nx], u[b, z, y, beyond : beyond + nx]
         sums, counts = out[b, z, y], total[b, z, y]
         sums[:] = 0.0
         counts[:] = 1.0
         for k in range(len(weights)):
-            zz, yy, dx = z + offsets[k, 0], y + offsets[k, 1], offsets[k, 2]
+            zz, yy, at = z + offsets[k, 0], y + offsets[k, 1], beyond + offsets[k, 2]
             if zz < 0 or zz >= nz or yy < 0 or yy >= ny:
                 continue
-            first, last = max(0, -dx), min(nx, nx - dx)
-            s, there, values = weights[k], g[b, zz, yy], u[b, zz, yy]
-            for x in range(first, last):
-                d = there[x + dx] - here[x]
+            s, g1, u1 = weights[k], g[b, zz, yy, at : at + nx], u[b, zz, yy, at : at + nx]
+            for x in range(nx):
+                d = g1[x] - g0[x]
                 r = max(np.float32(1.0) - d * d * quarter, np.float32(0.0))
                 w = s * r * r
-                sums[x] += w * (values[x + dx] - mine[x])
+                sums[x] += w * (u1[x] - u0[x])
                 counts[x] += w
         for x in range(nx):
-            sums[x] = mine[x] + sums[x] / counts[x]
+            sums[x] = u0[x] + sums[x] / counts[x]
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _backward(begin, end, u, g, scale, offsets, weights, out, total, grad, grad_u, grad_g):
+def _backward(begin, end, u, g, scale, offsets, weights, beyond, out, share, grad_u, grad_g):
     """Gradients by volume and guide, gathered: what row ``begin … end`` gives to others, and
-    they to it."""
-    nz, ny, nx = u.shape[1:]
+    they to it.
+
+    share: the gradient over the sum of weights; it, u, g and out have longer rows, as above.
+    """
+    nz, ny, nx = grad_u.shape[1:]
+    here = slice(beyond, beyond + nx)
     for row in range(begin, end):
         b, z, y = row // (nz * ny), row // ny % nz, row % ny
         quarter = np.float32(0.25) * scale[b] * scale[b]
-        for x in range(nx):
-            grad_u[b, z, y, x] = grad[b, z, y, x] / total[b, z, y, x]
-            grad_g[b, z, y, x] = 0.0
+        u0, g0, out0, share0 = (
+            u[b, z, y, here],
+            g[b, z, y, here],
+            out[b, z, y, here],
+            share[b, z, y, here],
+        )
+        by_u, by_g = grad_u[b, z, y], grad_g[b, z, y]
+        by_u[:] = share0
+        by_g[:] = 0.0
         for k in range(len(weights)):
-            zz, yy, dx = z + offsets[k, 0], y + offsets[k, 1], offsets[k, 2]
+            zz, yy, at = z + offsets[k, 0], y + offsets[k, 1], beyond + offsets[k, 2]
             if zz < 0 or zz >= nz or yy < 0 or yy >= ny:
                 continue
-            first, last = max(0, -dx), min(nx, nx - dx)
-            s = weights[k]
-            for x in range(first, last):
-                j = x + dx
-                d = g[b, zz, yy, j] - g[b, z, y, x]
+            s, there = weights[k], slice(at, at + nx)
+            u1, g1, out1, share1 = (
+                u[b, zz, yy, there],
+                g[b, zz, yy, there],
+                out[b, zz, yy, there],
+                share[b, zz, yy, there],
+            )
+            for x in range(nx):
+                d = g1[x] - g0[x]
                 r = max(np.float32(1.0) - d * d * quarter, np.float32(0.0))
-                own = grad[b, z, y, x] / total[b, z, y, x]
-                other = grad[b, zz, yy, j] / total[b, zz, yy, j]
-                grad_u[b, z, y, x] += s * r * r * other
-                # dw/dd = −s r d scale²: by g here with the other sign, and as a neighbour of j.
-                slope = s * r * d * np.float32(4.0) * quarter
-                grad_g[b, z, y, x] += slope * own * (u[b, zz, yy, j] - out[b, z, y, x])
-                grad_g[b, z, y, x] += slope * other * (u[b, z, y, x] - out[b, zz, yy, j])
+                w = s * r
+                by_u[x] += w * r * share1[x]
+                # dw/dd = −s r d scale²: by g here with the other sign, and as a neighbour of g1.
+                by_g[x] += w * d * (share0[x] * (u1[x] - out0[x]) + share1[x] * (u0[x] - out1[x]))
+        for x in range(nx):
+            by_g[x] *= np.float32(4.0) * quarter
 
 
 class _Bilateral(torch.autograd.Function):
@@ -117,46 +142,56 @@ class _Bilateral(torch.autograd.Function):
                 torch.from_numpy(weights).to(u.device),
             )
             out, total = bilateral_triton.forward(values, g, scale, *near)
-            ctx.kept = (values, g, scale, *near, out, total, u.dtype)
+            ctx.kept = ((values, g, scale, *near), out, total, u.dtype)
             return out.to(u.dtype)
-        out, total = torch.empty_like(values), torch.empty_like(values)
-        rows = math.prod(values.shape[:3])
-        given = [v.numpy() for v in (values, g, scale)]
-        run(
-            _forward,
-            rows,
-            *given,
+        beyond, nx = int(offsets[:, 2].max(initial=0)), u.shape[-1]
+        out, total = (torch.empty(*u.shape[:-1], nx + -nx % _AT_ONCE) for _ in range(2))
+        # Beyond the ends of its rows the guide is so far from all its values that nothing counts.
+        finite = torch.nan_to_num(g, 0.0, 0.0, 0.0)
+        apart = float(2.0 * finite.abs().amax() + 4.0 / scale.amin()) if g.numel() else 0.0
+        given = (
+            _padded(values, beyond),
+            _padded(g, beyond, apart),
+            scale.numpy(),
             offsets,
             weights,
+            beyond,
+        )
+        run(
+            _forward,
+            math.prod(u.shape[:3]),
+            *given,
             out.numpy(),
             total.numpy(),
-            operations=8 * len(weights) * values.shape[3],
+            operations=8 * len(weights) * nx,
         )
-        ctx.kept = (values, g, scale, offsets, weights, out, total, u.dtype)
+        out, total = out[..., :nx].contiguous(), total[..., :nx]
+        ctx.kept = (given, out, total, u.dtype)
         return out.to(u.dtype)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Any:
-        values, g, scale, offsets, weights, out, total, dtype = ctx.kept
+        given, out, total, dtype = ctx.kept
         slope = grad.detach().float().contiguous()
         if grad.device.type != "cpu":
             from recon.mbir import bilateral_triton
 
-            found = bilateral_triton.backward(values, g, scale, offsets, weights, out, total, slope)
+            u, g, scale, *near = given
+            found = bilateral_triton.backward(u, g, scale, near[0], near[1], out, total, slope)
         else:
-            found = torch.empty_like(values), torch.empty_like(values)
-            rows = math.prod(values.shape[:3])
-            given = [v.numpy() for v in (values, g, scale)]
-            kept = [v.numpy() for v in (out, total, slope, *found)]
+            *_, weights, beyond = given
+            nx = out.shape[-1]
+            made = [torch.empty(*out.shape[:-1], nx + -nx % _AT_ONCE) for _ in range(2)]
             run(
                 _backward,
-                rows,
+                math.prod(out.shape[:3]),
                 *given,
-                offsets,
-                weights,
-                *kept,
-                operations=20 * len(weights) * values.shape[3],
+                _padded(out, beyond),
+                _padded(slope / total, beyond),
+                *(v.numpy() for v in made),
+                operations=15 * len(weights) * nx,
             )
+            found = (made[0][..., :nx].contiguous(), made[1][..., :nx].contiguous())
         return (*(f.to(dtype) for f in found), None, None, None)
 
 

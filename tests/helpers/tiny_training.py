@@ -97,12 +97,12 @@ def stub_config(**changes):
     return TrainConfig(**{**values, **changes})
 
 
-def run(out, config=None, objective=None, **options):
+def run(out, config=None, objective=None, model=None, **options):
     """:func:`train.loop.train` on the stubs: the last state, and the signal that ended it."""
     options = {"tensorboard": False, **options}
     config = config or stub_config()
     data, objective = StubData(config.seed), objective or StubObjective()
-    return train(config, stub_model(config.seed), data, data, objective, out, **options)
+    return train(config, model or stub_model(config.seed), data, data, objective, out, **options)
 
 
 def stub_build(objective):
@@ -180,7 +180,8 @@ def _slow(out):
 
 
 def _gradients(out):
-    """One process of two: a gradient, a whole run, and the same run interrupted and resumed."""
+    """One process of two: a gradient, a whole run, the same run interrupted and resumed, and one with
+    SOAP, of which every process keeps its own weights."""
     out = Path(out)
     if "STORE" in os.environ:
         rank = int(os.environ["RANK"])
@@ -201,6 +202,9 @@ def _gradients(out):
     assert state.step == 8
     distributed.barrier()
     assert run(out / "two", config, resume=True)[0].step == STEPS
+    soap = stub_config(batch=5, optimiser="soap")
+    run(out / "soap", soap, model=model)
+    write_tensors(out / f"soap{rank}.safetensors", "weights", model.state_dict(), {})
     group = weakref.ref(distributed.group.WORLD)
     distributed.destroy_process_group()
     assert group() is None, (

@@ -91,6 +91,10 @@ def test_two_processes_give_the_gradients_of_one(tmp_path, launcher):
     ]
     # Resumed, it gives the bits of the uninterrupted run of two processes.
     assert_same_run(tmp_path / "two", tmp_path / "whole")
+    # Each process computes bases and steps of SOAP by itself, from the same gradients.
+    a, b = (read_tensors(tmp_path / f"soap{r}.safetensors", "weights")[0] for r in (0, 1))
+    assert_same_tensors(a, b)
+    assert not torch.equal(a["0.weight"], stub_model().state_dict()["0.weight"])
 
 
 @pytest.mark.slow

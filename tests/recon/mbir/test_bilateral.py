@@ -55,9 +55,17 @@ def test_without_noise_nothing_is_filtered_and_nan_raises_nothing():
     torch.testing.assert_close(joint_bilateral(u, guide, 0.0 * T), u)
     bad = u.clone()
     bad[0, 2, 3, 4] = float("nan")
-    found = joint_bilateral(bad, guide, T)
-    assert bool(found[0].isnan().any())
-    assert bool(found[1].isfinite().all())
+    for found in (joint_bilateral(bad, guide, T), joint_bilateral(u, bad, T)):
+        assert bool(found[1].isfinite().all())
+    assert bool(joint_bilateral(bad, guide, T)[0].isnan().any())
+
+
+@pytest.mark.parametrize("nx", [1, 5, 16, 37])
+def test_rows_of_any_length(nx):
+    u, guide = volumes((2, 3, 4, nx))
+    guide = guide + 1e3
+    found = joint_bilateral(u, guide, T).double()
+    torch.testing.assert_close(found, by_definition(u, guide, T), rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("which", [0, 1])
