@@ -124,6 +124,35 @@ def _backward(begin, end, u, g, scale, offsets, weights, beyond, out, share, gra
             by_g[x] *= np.float32(4.0) * quarter
 
 
+def on_cpu(
+    u: Tensor, g: Tensor, scale: Tensor, offsets: NDArray[np.int64], weights: NDArray[np.float32]
+) -> tuple[tuple[Any, ...], Tensor, Tensor]:
+    """What the kernels were given, the filtered volumes and the sums of weights; arguments as of
+    :func:`recon.mbir.bilateral_triton.forward`."""
+    beyond, nx = int(offsets[:, 2].max(initial=0)), u.shape[-1]
+    out, total = (torch.empty(*u.shape[:-1], nx + -nx % _AT_ONCE) for _ in range(2))
+    # Beyond the ends of its rows the guide is so far from all its values that nothing counts.
+    finite = torch.nan_to_num(g, 0.0, 0.0, 0.0)
+    apart = float(2.0 * finite.abs().amax() + 4.0 / scale.amin()) if g.numel() else 0.0
+    given = (
+        _padded(u, beyond),
+        _padded(g, beyond, apart),
+        scale.numpy(),
+        offsets,
+        weights,
+        beyond,
+    )
+    run(
+        _forward,
+        math.prod(u.shape[:3]),
+        *given,
+        out.numpy(),
+        total.numpy(),
+        operations=8 * len(weights) * nx,
+    )
+    return given, out[..., :nx].contiguous(), total[..., :nx].contiguous()
+
+
 class _Bilateral(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -144,28 +173,7 @@ class _Bilateral(torch.autograd.Function):
             out, total = bilateral_triton.forward(values, g, scale, *near)
             ctx.kept = ((values, g, scale, *near), out, total, u.dtype)
             return out.to(u.dtype)
-        beyond, nx = int(offsets[:, 2].max(initial=0)), u.shape[-1]
-        out, total = (torch.empty(*u.shape[:-1], nx + -nx % _AT_ONCE) for _ in range(2))
-        # Beyond the ends of its rows the guide is so far from all its values that nothing counts.
-        finite = torch.nan_to_num(g, 0.0, 0.0, 0.0)
-        apart = float(2.0 * finite.abs().amax() + 4.0 / scale.amin()) if g.numel() else 0.0
-        given = (
-            _padded(values, beyond),
-            _padded(g, beyond, apart),
-            scale.numpy(),
-            offsets,
-            weights,
-            beyond,
-        )
-        run(
-            _forward,
-            math.prod(u.shape[:3]),
-            *given,
-            out.numpy(),
-            total.numpy(),
-            operations=8 * len(weights) * nx,
-        )
-        out, total = out[..., :nx].contiguous(), total[..., :nx]
+        given, out, total = on_cpu(values, g, scale, offsets, weights)
         ctx.kept = (given, out, total, u.dtype)
         return out.to(u.dtype)
 

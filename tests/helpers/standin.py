@@ -170,17 +170,8 @@ def _backproject(plan, data):
 
 def _bilateral(u, g, scale, offsets, weights):
     with _disable_current_modes():
-        out, total = torch.empty_like(u.inner), torch.empty_like(u.inner)
-        given = [v.inner.numpy() for v in (u, g, scale, offsets, weights)]
-        bilateral._forward(
-            0,
-            math.prod(u.shape[:3]),
-            *given[:3],
-            given[3].astype(np.int64),
-            given[4],
-            out.numpy(),
-            total.numpy(),
-        )
+        values, guide, over, near, share = (v.inner for v in (u, g, scale, offsets, weights))
+        _, out, total = bilateral.on_cpu(values, guide, over, near.long().numpy(), share.numpy())
     return Standin(out), Standin(total)
 
 

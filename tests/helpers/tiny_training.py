@@ -180,8 +180,8 @@ def _slow(out):
 
 
 def _gradients(out):
-    """One process of two: a gradient, a whole run, the same run interrupted and resumed, and one with
-    SOAP, of which every process keeps its own weights."""
+    """One process of two: a gradient, a whole run, the same run interrupted and resumed, and one
+    with SOAP, of which every process keeps its own weights."""
     out = Path(out)
     if "STORE" in os.environ:
         rank = int(os.environ["RANK"])
