@@ -74,11 +74,15 @@ _SEVERAL = 0.5
 """Standard deviation of these readings, in photons, from which there are several of them."""
 _RESOLVED = 0.5
 """Mean cosine of readings between whole photons from which they are resolved."""
-_SINGLE = 2.0
-"""Photons that a tenth of them does not exceed."""
-_CLEARLY = 0.2
+_CLEARLY = 0.05
 """How much more it must be of whole photons than of halves, or less."""
-_NEARBY = np.linspace(0.9, 1.1, 41)
+_ERRORS = 5.0
+"""Standard errors that it must be more beyond that."""
+_SAME = 1.001
+"""Factor within which readings are the same."""
+_CLIPPED_SHARE = 0.05
+"""Share of readings that are the lowest one, from which those without a photon were set to it."""
+_NEARBY = np.linspace(0.75, 1.3, 111)
 """Factors within which the noise tells the signal of a photon."""
 _MOST = 4000
 """Readings of a group that are looked at for single photons."""
@@ -168,13 +172,17 @@ def _made(y: Floats) -> _Made | None:
     classes = [_transfer(y[..., columns]) for columns in groups]
     if not all(level.size for level, _, _ in classes):
         return None
-    fits = {beyond: _units(classes, beyond) for beyond in _BEYOND}
-    counted = {k: _counted(y, groups, fits[k][0], k == -0.5) for k in (0.0, -0.5, -1.0)}
-    clearest = max(counted, key=lambda k: counted[k][0])
+    clipped = np.array([_at_lowest(y[..., columns]) > _CLIPPED_SHARE for columns in groups])
+    fits = {beyond: _units(classes, clipped, beyond) for beyond in _BEYOND}
+    counted = _counted(y, groups, {k: fits[k][0] for k in (0.0, -0.5, -1.0)})
+    clearest = max(counted, key=lambda k: counted[k].score)
     alike = (-0.5,) if clearest == -0.5 else (-1.0, 0.0)
-    unlike = max(score for k, (score, _) in counted.items() if k not in alike)
-    if counted[clearest][0] > max(_RESOLVED, unlike + _CLEARLY):  # 0 or 1 were added, or a half
-        fits = {k: (counted[k][1], _misfit(classes, counted[k][1], k)) for k in alike}
+    found = counted[clearest]
+    unlike = max(comb.score for k, comb in counted.items() if k not in alike)
+    if found.score > max(_RESOLVED, unlike + _CLEARLY + _ERRORS * found.error):
+        # 0 or 1 were added, which are the same readings, or a half.
+        units_of = {k: np.where(found.known, found.units, fits[k][0]) for k in alike}
+        fits = {k: (units, _misfit(classes, units, k)) for k, units in units_of.items()}
     beyond = min(fits, key=lambda k: fits[k][1])
     others = [fit[1] for k, fit in fits.items() if k * beyond <= 0.0 and k != beyond]
     fitting = fits[beyond][1] < _FITS * sum(len(level) for level, _, _ in classes)
@@ -193,29 +201,59 @@ def _made(y: Floats) -> _Made | None:
     return made if darkest < _MOST_MEAN + 6.0 * made.noise else None
 
 
+def _at_lowest(y: Floats) -> float:
+    """Share of readings that are the lowest one."""
+    known = y[np.isfinite(y)]
+    return float(np.mean(known <= _SAME * known.min()))
+
+
+class _Comb(NamedTuple):
+    """How clearly the lowest readings are whole photons and what was added to them, 0 to 1; its
+    standard error; the signal of a photon in each group of columns, and of which it is known."""
+
+    score: float
+    error: float
+    units: Floats
+    known: NDArray[np.bool_]
+
+
 def _counted(
-    y: Floats, groups: list[NDArray[np.int64]], units: Floats, half: bool
-) -> tuple[float, Floats]:
-    """How clearly the lowest readings are single photons, or ½, 1½, 2½ … of them (``half``), 0 to
-    1; and the signal of one in each group of columns, near ``units``."""
-    found, clear, count = np.array(units), 0.0, 0
-    for k, (columns, unit) in enumerate(zip(groups, units, strict=True)):
-        x = y[..., columns].ravel() / unit
-        x = x[(x > 0.3) & (x < _COUNTED)][:_MOST]
+    y: Floats, groups: list[NDArray[np.int64]], units: dict[float, Floats]
+) -> dict[float, _Comb]:
+    """What whole photons tell where 0, ½ or 1 was added (keys: its negative), near the ``units``
+    by the noise. All are judged by the same groups of columns."""
+    found = {k: unit.copy() for k, unit in units.items()}
+    known = np.zeros(len(groups), dtype=np.bool_)
+    cosines: dict[float, list[Floats]] = {k: [] for k in units}
+    for at, columns in enumerate(groups):
+        readings = y[..., columns][np.isfinite(y[..., columns])]
+        # The lowest may be what readings without a photon are set to.
+        readings = readings[readings > _SAME * readings.min()]
+        lowest = {k: (readings / unit[at]) for k, unit in units.items()}
+        lowest = {k: x[x < _COUNTED][:_MOST] for k, x in lowest.items()}
         # A few photons more or less fit a longer or shorter step as well.
-        if x.size < _FEWEST or x.std() < _SEVERAL or np.quantile(x, 0.1) > _SINGLE:
+        if any(x.size < _FEWEST or x.std() < _SEVERAL for x in lowest.values()):
             continue
-        steps = np.cos(2.0 * math.pi * (x / _NEARBY[:, None] + 0.5 * half)).mean(1)
-        best = int(steps.argmax())
-        found[k] *= _NEARBY[best]
-        clear += x.size * float(steps[best])
-        count += x.size
-    return (clear / count if count else 0.0), found
+        known[at] = True
+        for k, x in lowest.items():
+            half = 0.5 * (k == -0.5)
+            steps = np.cos(2.0 * math.pi * (x / _NEARBY[:, None] + half))
+            best = int(steps.mean(1).argmax())
+            found[k][at] *= _NEARBY[best]
+            cosines[k].append(steps[best])
+    combs = {}
+    for k, of in cosines.items():
+        every = np.concatenate(of) if of else np.zeros(1)
+        error = float(every.std()) / math.sqrt(every.size)
+        combs[k] = _Comb(float(every.mean()), error, found[k], known)
+    return combs
 
 
-def _units(classes: list[tuple[Floats, Floats, Floats]], beyond: float) -> tuple[Floats, float]:
+def _units(
+    classes: list[tuple[Floats, Floats, Floats]], clipped: NDArray[np.bool_], beyond: float
+) -> tuple[Floats, float]:
     """The signal of a photon in each group of columns where the variance of ``m`` photons is ``m +
-    beyond``, and how badly that fits (χ²)."""
+    beyond``, and how badly that fits (χ²); of ``clipped`` groups noise does not tell it."""
     units, bright = np.empty(len(classes)), np.zeros(len(classes), dtype=np.bool_)
     for k, (level, variance, _) in enumerate(classes):
         unit = float(np.median(variance / level))
@@ -231,7 +269,7 @@ def _units(classes: list[tuple[Floats, Floats, Floats]], beyond: float) -> tuple
                 break
             unit *= ratio**0.5
         units[k] = unit
-        bright[k] = np.median(level / unit) > _BRIGHT
+        bright[k] = not clipped[k] and np.median(level / unit) > _BRIGHT
     if bright.any():  # single photons, clipped or not, tell little of their signal
         at = np.arange(len(units))
         units = np.where(bright, units, np.interp(at, at[bright], units[bright]))
@@ -271,11 +309,12 @@ def _along(y: Floats) -> tuple[Floats, Floats, Floats]:
     second, mean = second[known], mean[known]
     if second.size < _FEWEST:
         return (np.zeros(0),) * 3
-    edges = np.quantile(mean, np.linspace(0.0, 1.0, _CLASSES + 1))
-    at = np.clip(np.searchsorted(edges, mean, "right") - 1, 0, _CLASSES - 1)
+    # Sums of three whole numbers are often equal but for their last digits, which depend on what
+    # was summed: these must not decide which of them belong to a class.
+    order = np.argsort(np.round(np.log(mean), 3), kind="stable")
     found = []
-    for k in range(_CLASSES):
-        d, m = second[at == k], mean[at == k]
+    for members in np.array_split(order, _CLASSES):
+        d, m = second[members], mean[members]
         if d.size < _FEWEST:
             continue
         # Given the sum of three readings of photons, its variance is exactly six times their mean.
