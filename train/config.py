@@ -252,8 +252,10 @@ class ObjectiveConfig:
         white: of ‖e‖², against ``data``; edge: by how much more within two voxels of an edge; body:
             in bodies and one voxel about them; flat: in bodies, where the truth is constant for
             two voxels around, such as deep in a lumen; flat_from: share of the training after
-            which ``flat`` counts.
+            which ``flat`` and ``image_bias`` count.
         relative: of ‖e‖² over that of the filtered view, with the same weights of places.
+        image_bias: by how much more than the variance the squared bias of each voxel counts in
+            ``relative``, at fidelity 0 and at fidelity 1, linear between.
         noise_free: of these of the same scene without noise, against those with noise: what is left
             there is blur and overshoot.
         contrast: of the ROI contrasts' errors at fidelity 1; viewing: share of it that is left at
@@ -274,6 +276,7 @@ class ObjectiveConfig:
     flat: float = 0.0
     flat_from: float = 0.0
     relative: float = 0.0
+    image_bias: tuple[float, float] = (0.0, 0.0)
     noise_free: float = 0.0
     contrast: float = 0.2
     viewing: float = 1.0
@@ -299,13 +302,14 @@ class ObjectiveConfig:
         _set(self, flat_from=number("flat_from", self.flat_from, low=0.0, high=1.0))
         _set(self, viewing=number("viewing", self.viewing, low=0.0, high=1.0))
         _set(self, contrast_sd=number("contrast_sd", self.contrast_sd, positive=True))
-        first, last = numbers("bias", self.bias, 2)
-        if not (first >= 0 and last >= 0):
-            raise ValueError(
-                "bias must be two weights of at least 0, of fidelity 0 and fidelity 1, got "
-                f"{self.bias}"
-            )
-        _set(self, bias=(first, last))
+        for name in ("bias", "image_bias"):
+            first, last = numbers(name, getattr(self, name), 2)
+            if not (first >= 0 and last >= 0):
+                raise ValueError(
+                    f"{name} must be two weights of at least 0, of fidelity 0 and fidelity 1, got "
+                    f"{getattr(self, name)}"
+                )
+            _set(self, **{name: (first, last)})
         low, high = numbers("fidelities", self.fidelities, 2)
         if not 0 <= low <= high <= 1:
             raise ValueError(f"fidelities must be a range within 0 … 1, got {self.fidelities}")
@@ -430,7 +434,8 @@ class TrainConfig:
     def end_begins(self) -> int:
         """The first step that depends on how many there will be."""
         o = self.objective
-        flat = round(self.steps * o.flat_from) if o.flat else self.steps
+        later = bool(o.flat) or o.image_bias != (0.0, 0.0)
+        flat = round(self.steps * o.flat_from) if later else self.steps
         fewer = 0 if self.unroll > 1 and self.single else self.steps
         return min(self.decay_begins, self.late_begins, flat, fewer)
 

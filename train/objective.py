@@ -12,6 +12,9 @@ with errors e₁, e₂ in noise units:
 * ``relative``: the same over that of the filtered view of the same data, so that scenes count
   alike: their squared errors differ by far more than one power of ten, and the largest decide a
   step. With it fewer steps are needed for the same error (``train/experiments.md``);
+* ``image_bias``: e₁ᵀe₂ per voxel, over the same. As the draws are independent, its mean is the
+  squared bias, so κ trades variance against bias in every voxel: small and faint bodies, which are
+  nothing beside the error of edges, are shown instead of smoothed away;
 * ``noise_free``: all of these of the same scene without noise, where all that is left is blur and
   overshoot beside edges;
 * ``contrast``: the errors d of ROI contrasts, small ones and that of a whole core, (d₁² + d₂²) / 2
@@ -136,7 +139,7 @@ class Objective:
             places = places + c.flat * batch.bodies * (spread(batch.truth) < _FLAT_HU)
         counts = 1.0 + places[scene]
         white = (error.square() * counts).mean(dim=(1, 2, 3))
-        image, data = torch.zeros_like(white), None
+        image, data, bias = torch.zeros_like(white), None, torch.zeros_like(white[0])
         if c.data:
             data = (error * problem.apply(error)).mean(dim=(1, 2, 3))
             image = c.data * (data + c.white * white) / (1.0 + data.detach() / _TAME_ERROR)
@@ -145,13 +148,18 @@ class Objective:
             of_view = ((towards if smoothed is None else smoothed) - truth).square()
             measure = (of_view * counts).mean(dim=(1, 2, 3)).clamp_min(_LEAST_ERROR)
             image = image + c.relative * white / measure
+            if c.image_bias != (0.0, 0.0) and progress >= c.flat_from:
+                both = (error[:n] * error[n : 2 * n] * counts[:n]).mean(dim=(1, 2, 3))
+                first, last = c.image_bias
+                shared = both / (measure[:n] * measure[n : 2 * n]).sqrt()
+                bias = c.relative * ((first + (last - first) * fidelity) * shared).sum()
         noisy, error = image[: 2 * n], error[: 2 * n]
         # The noise of an ROI mean falls with its size, but less than as 1/√voxels: neighbours are
         # correlated.
         size = (20.0 / batch.voxels.clamp_min(4.0)).pow(0.25) * c.contrast_sd
         d = torch.einsum("dnzyx,nrzyx->dnr", error.unflatten(0, (2, n)), batch.contrast) / size
         variance, product = d.square().mean(0), d[0] * d[1]
-        total = 0.5 * noisy.sum()
+        total = 0.5 * noisy.sum() + bias
         tame = 1.0 / (1.0 + variance.detach() / _TAME_CONTRAST)
         kappa = (c.bias[0] + (c.bias[1] - c.bias[0]) * fidelity)[:, None]
         weight = c.contrast * (c.viewing + (1.0 - c.viewing) * fidelity)[:, None]

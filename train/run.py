@@ -197,7 +197,14 @@ class Run:
         reached = metadata["state"]["step"]
         # What comes later has changed nothing yet.
         if reached <= min(self.config.end_begins, before.end_begins):
-            other -= {"steps", "decay", "final_fraction", "objective.flat_from"}
+            other -= {
+                "steps",
+                "decay",
+                "final_fraction",
+                "objective.flat",
+                "objective.flat_from",
+                "objective.image_bias",
+            }
         if reached <= min(self.config.late_begins, before.late_begins):
             other = {name for name in other if not name.startswith("late.")}
         if other:

@@ -84,6 +84,28 @@ def test_scenes_count_alike_by_their_relative_error(data):
     assert "data" not in loss.parts
 
 
+def test_bias_of_the_image_is_what_both_draws_share(data):
+    """Errors that are opposite in both draws are noise, equal ones are bias, wherever they are."""
+    batch = data.batch(0, 4, range(2))
+    truth, (_, _, smoothed) = truth_of(batch), batch.views
+    assert smoothed is not None
+    error = 0.5 * (smoothed[:2] - truth[:2])
+    options = {"data": 0.0, "relative": 3.0, "contrast": 0.0, "edge": 0.0, "flat_from": 0.5}
+
+    def total(sign, fidelity, bias, progress=1.0):
+        both = torch.cat([error, sign * error])
+        config = ObjectiveConfig(image_bias=bias, fidelities=(fidelity, fidelity), **options)
+        return float(Objective(config)(Given(truth + both), batch, progress).total)
+
+    for sign in (1.0, -1.0):
+        plain = total(sign, 1.0, (0.0, 0.0))
+        shared = total(sign, 1.0, (0.0, 1.0)) - plain
+        assert sign * shared > 0.5 * plain
+        assert total(sign, 1.0, (1.0, 4.0)) - plain == pytest.approx(4.0 * shared, rel=1e-4)
+        assert total(sign, 0.0, (1.0, 4.0)) - plain == pytest.approx(shared, rel=1e-4)
+        assert total(sign, 1.0, (1.0, 4.0), progress=0.4) == pytest.approx(plain)
+
+
 def test_without_a_filtered_view_the_step_towards_the_data_is_the_measure(data):
     batch = data.batch(0, 4, range(2))
     truth, (first, towards, _) = truth_of(batch), batch.views

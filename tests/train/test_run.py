@@ -6,6 +6,7 @@ import os
 import pickle
 import signal
 import time
+from dataclasses import replace
 
 import pytest
 import tiny_training
@@ -294,7 +295,13 @@ def test_what_comes_at_the_end_may_change_until_it_begins(tmp_path):
         stub_config(steps=n, decay=0.0, unroll=1, objective=ObjectiveConfig(flat=1.0, flat_from=f))
         for n, f in ((STEPS, 0.75), (2 * STEPS, 0.75), (STEPS, 0.9))
     ]
-    run(tmp_path / "y", flat[0], StubObjective({6: send(signal.SIGTERM)}))
+    run(tmp_path / "y", flat[0], StubObjective({2: send(signal.SIGTERM)}))
+    heavier = replace(flat[0], objective=ObjectiveConfig(flat=2.0, flat_from=0.75))
+    biased = replace(
+        flat[0], objective=ObjectiveConfig(flat=1.0, flat_from=0.75, image_bias=(0.0, 2.0))
+    )
+    for step, changed in ((4, heavier), (6, biased)):
+        run(tmp_path / "y", changed, StubObjective({step: send(signal.SIGTERM)}), resume=True)
     run(tmp_path / "y", flat[2], StubObjective({10: send(signal.SIGTERM)}), resume=True)
     with pytest.raises(ValueError, match="steps"):
         run(tmp_path / "y", flat[1], resume=True)
