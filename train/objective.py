@@ -56,6 +56,8 @@ _NOISE_FREE_SHARE = 0.5
 """Share of the scenes that are seen without noise too; there that counts so many times more."""
 _LEAST_CONTRAST_HU = 10.0
 """Contrasts below are none: what is read there is invented."""
+_FAINT_HU = 150.0
+"""Contrasts below are faint, of the validation."""
 _FLAT_HU = 10.0
 """Spread of the truth about a voxel, in HU, that is called constant."""
 
@@ -81,8 +83,9 @@ class Validation:
         score: higher is better; selects the checkpoint.
         figures: at low and at high exposures, ``error`` (root mean square in bodies over that of
             the bilateral filter in the network's place), ``all`` (the same over whole volumes),
-            ``slope`` of ROI contrasts against the true ones, ``false_hu``, the mean size of
-            contrasts where there is none.
+            ``slope`` of the cores' contrasts against the true ones, ``faint`` of all ROI contrasts
+            below 150 HU, which large ones would hide, ``false_hu``, the mean size of contrasts
+            where there is none.
         pictures: axial images in HU above the background, truth, volume and filter side by side.
     """
 
@@ -188,6 +191,7 @@ class Objective:
             held_out: whose scenes are used, all of them.
         """
         rows: list[dict[str, float]] = []
+        readings: list[list[tuple[float, float]]] = []
         pictures: dict[str, NDArray[np.float32]] = {}
         for step in range(held_out.batches_in_epoch(VALIDATED_AT_ONCE)):
             batch = held_out.batch(step, VALIDATED_AT_ONCE, range(VALIDATED_AT_ONCE))
@@ -213,6 +217,13 @@ class Objective:
             bodies = batch.bodies
             for i in range(batch.size):
                 inside, weights = bodies[i] > 0, batch.contrast[i, -1]
+                readings.append(
+                    [
+                        (float((batch.truth[i] * roi).sum()), float((made[i] * roi).sum()))
+                        for roi in batch.contrast[i]
+                        if roi.any()
+                    ]
+                )
                 errors = [(v[i] - batch.truth[i]).square() for v in (made, simple)]
                 row = {"scale": float(problem.unit_hu[i])}
                 for name, error in zip(("made", "simple"), errors, strict=True):
@@ -246,11 +257,20 @@ class Objective:
                     score -= counts * math.log(figures[f"{label}_{name}"])
             has, real = of["has"] > 0, np.abs(of["true"]) > _LEAST_CONTRAST_HU
             both = has & real
-            slope = (of["true"] * of["read"])[both].sum() / max(
-                np.square(of["true"][both]).sum(), 1e-9
+            figures[f"slope_{name}"] = _slope(of["true"][both], of["read"][both])
+            true, read = (
+                np.array([pair for i in np.flatnonzero(chosen) for pair in readings[i]])
+                .reshape(-1, 2)
+                .T
             )
-            figures[f"slope_{name}"] = float(slope)
+            faint = (np.abs(true) > _LEAST_CONTRAST_HU) & (np.abs(true) < _FAINT_HU)
+            figures[f"faint_{name}"] = _slope(true[faint], read[faint])
             figures[f"false_hu_{name}"] = (
                 float(np.abs(of["read"])[has & ~real].mean()) if (has & ~real).any() else 0.0
             )
         return Validation(score, figures, pictures)
+
+
+def _slope(true: NDArray[np.float64], read: NDArray[np.float64]) -> float:
+    """Of what is read against what is true, through the origin; NaN of nothing."""
+    return float((true * read).sum() / np.square(true).sum()) if true.size else math.nan

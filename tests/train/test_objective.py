@@ -245,6 +245,32 @@ def test_validation_is_relative_to_the_filter(data):
     )
 
 
+def test_large_contrasts_do_not_hide_how_faint_ones_are_shown(data):
+    """Half of the contrast is shown below 150 HU, all of it above."""
+    held_out = Data(replace(CONFIG, scenes_kept=40), 11, data.views.folder.parent)
+    held_out._terms = data._terms
+    drawn, truths = held_out.batch, []
+
+    def of_one_voxel(*given):
+        """Contrasts of each scene's first voxel that lies in a body, to the background's 0."""
+        batch = drawn(*given)
+        truths.append(batch.truth)
+        body = (batch.truth.abs() > 20.0).flatten(1).float()
+        first = body * (body.cumsum(1) == 1.0)
+        return replace(batch, contrast=first.reshape(batch.truth.shape)[:, None])
+
+    def shown(problem):
+        truth = truths[-1]
+        halved = torch.where(truth.abs() < 150.0, 0.5 * truth, truth)
+        return halved / problem.unit_hu.reshape(-1, 1, 1, 1)
+
+    held_out.batch = of_one_voxel
+    figures = Objective().validate(Given(shown), held_out).figures
+    for dose in ("low", "high"):
+        assert figures[f"faint_{dose}"] == pytest.approx(0.5, rel=1e-3)
+        assert figures[f"slope_{dose}"] > 0.55
+
+
 def test_edges_reach_two_voxels_to_either_side():
     truth = torch.zeros(9, 9, 12)
     truth[..., 6:] = 100.0
