@@ -433,11 +433,16 @@ class TrainConfig:
     @property
     def end_begins(self) -> int:
         """The first step that depends on how many there will be."""
+        fewer = 0 if self.unroll > 1 and self.single else self.steps
+        changes = self.steps if self.loss_changes is None else self.loss_changes
+        return min(self.decay_begins, self.late_begins, changes, fewer)
+
+    @property
+    def loss_changes(self) -> int | None:
+        """The first step with all parts of the loss; None if all steps have them."""
         o = self.objective
         later = bool(o.flat) or o.image_bias != (0.0, 0.0)
-        flat = round(self.steps * o.flat_from) if later else self.steps
-        fewer = 0 if self.unroll > 1 and self.single else self.steps
-        return min(self.decay_begins, self.late_begins, flat, fewer)
+        return round(self.steps * o.flat_from) if later else None
 
     @property
     def late_begins(self) -> int:

@@ -285,7 +285,12 @@ class Run:
         score = float(result.score)
         figures = {k: float(v) for k, v in result.figures.items() if k != "score"}
         self._tick()
-        better = math.isfinite(score) and (state.best is None or score > state.best["score"])
+        better = math.isfinite(score) and (
+            state.best is None
+            or score > state.best["score"]
+            # A part of the loss that comes later may cost some of the score.
+            or state.best["step"] < (self.config.loss_changes or 0) <= state.step
+        )
         if better:
             state.best = {
                 "score": score,

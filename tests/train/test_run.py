@@ -324,6 +324,20 @@ def test_it_trains_and_the_best_average_is_shipped(uninterrupted):
     assert last["step"] == str(STEPS)
 
 
+def test_weights_of_a_part_of_the_loss_do_not_ship(tmp_path):
+    """However good their score was: what comes later may cost some of it."""
+
+    class Falling(StubObjective):
+        def validate(self, model, held_out):
+            return replace(super().validate(model, held_out), score=-float(self.validations))
+
+    for flat_from, step in ((0.5, 10), (0.0, 5)):
+        config = stub_config(objective=ObjectiveConfig(flat=1.0, flat_from=flat_from))
+        out = tmp_path / str(flat_from)
+        run(out, config, Falling())
+        assert json.loads((out / "card.json").read_text())["step"] == step
+
+
 def test_average_of_weights(tmp_path):
     """The average is the recursion over the weights of every step."""
     seen = []
