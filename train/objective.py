@@ -116,8 +116,7 @@ class Objective:
         free = torch.nonzero((batch.lots[:, 1] < _NOISE_FREE_SHARE) & bool(c.noise_free))[:, 0]
         rows = torch.cat([torch.arange(2 * n, device=free.device), 2 * n + free])
         scene = rows % n
-        low, high = c.fidelities
-        fidelity = low + (high - low) * batch.lots[:, 0]
+        fidelity = _between(c.fidelities, batch.lots[:, 0])
 
         def network(
             estimate: Tensor, towards: Tensor, condition: Tensor, smoothed: Tensor | None
@@ -153,9 +152,8 @@ class Objective:
             image = image + c.relative * white / measure
             if c.image_bias != (0.0, 0.0) and progress >= c.flat_from:
                 both = (error[:n] * error[n : 2 * n] * counts[:n]).mean(dim=(1, 2, 3))
-                first, last = c.image_bias
                 shared = both / (measure[:n] * measure[n : 2 * n]).sqrt()
-                bias = c.relative * ((first + (last - first) * fidelity) * shared).sum()
+                bias = c.relative * (_between(c.image_bias, fidelity) * shared).sum()
         noisy, error = image[: 2 * n], error[: 2 * n]
         # The noise of an ROI mean falls with its size, but less than as 1/√voxels: neighbours are
         # correlated.
@@ -164,7 +162,7 @@ class Objective:
         variance, product = d.square().mean(0), d[0] * d[1]
         total = 0.5 * noisy.sum() + bias
         tame = 1.0 / (1.0 + variance.detach() / _TAME_CONTRAST)
-        kappa = (c.bias[0] + (c.bias[1] - c.bias[0]) * fidelity)[:, None]
+        kappa = _between(c.bias, fidelity)[:, None]
         weight = c.contrast * (c.viewing + (1.0 - c.viewing) * fidelity)[:, None]
         total = total + (weight * tame * (variance + kappa * product)).sum()
         parts = {
@@ -191,7 +189,7 @@ class Objective:
             held_out: whose scenes are used, all of them.
         """
         rows: list[dict[str, float]] = []
-        readings: list[list[tuple[float, float]]] = []
+        contrasts: list[list[tuple[float, float]]] = []
         pictures: dict[str, NDArray[np.float32]] = {}
         for step in range(held_out.batches_in_epoch(VALIDATED_AT_ONCE)):
             batch = held_out.batch(step, VALIDATED_AT_ONCE, range(VALIDATED_AT_ONCE))
@@ -216,12 +214,11 @@ class Objective:
             made, simple = volume(None) * scale, self._filtered[step]
             bodies = batch.bodies
             for i in range(batch.size):
-                inside, weights = bodies[i] > 0, batch.contrast[i, -1]
-                readings.append(
+                inside = bodies[i] > 0
+                contrasts.append(
                     [
                         (float((batch.truth[i] * roi).sum()), float((made[i] * roi).sum()))
                         for roi in batch.contrast[i]
-                        if roi.any()
                     ]
                 )
                 errors = [(v[i] - batch.truth[i]).square() for v in (made, simple)]
@@ -231,10 +228,8 @@ class Objective:
                         float(error[inside].mean()) if inside.any() else math.nan
                     )
                     row[f"{name}_all"] = float(error.mean())
-                row["true"], row["read"] = (
-                    float((v[i] * weights).sum()) for v in (batch.truth, made)
-                )
-                row["has"] = float(weights.any())
+                row["true"], row["read"] = contrasts[-1][-1]
+                row["has"] = float(batch.contrast[i, -1].any())
                 rows.append(row)
             if step < 4:
                 middle = made.shape[1] // 2
@@ -258,17 +253,19 @@ class Objective:
             has, real = of["has"] > 0, np.abs(of["true"]) > _LEAST_CONTRAST_HU
             both = has & real
             figures[f"slope_{name}"] = _slope(of["true"][both], of["read"][both])
-            true, read = (
-                np.array([pair for i in np.flatnonzero(chosen) for pair in readings[i]])
-                .reshape(-1, 2)
-                .T
-            )
+            true, read = np.array(contrasts)[chosen].reshape(-1, 2).T
             faint = (np.abs(true) > _LEAST_CONTRAST_HU) & (np.abs(true) < _FAINT_HU)
             figures[f"faint_{name}"] = _slope(true[faint], read[faint])
             figures[f"false_hu_{name}"] = (
                 float(np.abs(of["read"])[has & ~real].mean()) if (has & ~real).any() else 0.0
             )
         return Validation(score, figures, pictures)
+
+
+def _between(ends: tuple[float, float], share: Tensor) -> Tensor:
+    """From the first to the last, linear in the share."""
+    first, last = ends
+    return first + (last - first) * share
 
 
 def _slope(true: NDArray[np.float64], read: NDArray[np.float64]) -> float:

@@ -174,14 +174,14 @@ def _made(y: Floats) -> _Made | None:
         return None
     clipped = np.array([_at_lowest(y[..., columns]) > _CLIPPED_SHARE for columns in groups])
     fits = {beyond: _units(classes, clipped, beyond) for beyond in _BEYOND}
-    counted = _counted(y, groups, {k: fits[k][0] for k in (0.0, -0.5, -1.0)})
+    counted, known = _counted(y, groups, {k: fits[k][0] for k in (0.0, -0.5, -1.0)})
     clearest = max(counted, key=lambda k: counted[k].score)
     alike = (-0.5,) if clearest == -0.5 else (-1.0, 0.0)
     found = counted[clearest]
-    unlike = max(comb.score for k, comb in counted.items() if k not in alike)
+    unlike = max(other.score for k, other in counted.items() if k not in alike)
     if found.score > max(_RESOLVED, unlike + _CLEARLY + _ERRORS * found.error):
         # 0 or 1 were added, which are the same readings, or a half.
-        units_of = {k: np.where(found.known, found.units, fits[k][0]) for k in alike}
+        units_of = {k: np.where(known, found.units, fits[k][0]) for k in alike}
         fits = {k: (units, _misfit(classes, units, k)) for k, units in units_of.items()}
     beyond = min(fits, key=lambda k: fits[k][1])
     others = [fit[1] for k, fit in fits.items() if k * beyond <= 0.0 and k != beyond]
@@ -207,21 +207,20 @@ def _at_lowest(y: Floats) -> float:
     return float(np.mean(known <= _SAME * known.min()))
 
 
-class _Comb(NamedTuple):
-    """How clearly the lowest readings are whole photons and what was added to them, 0 to 1; its
-    standard error; the signal of a photon in each group of columns, and of which it is known."""
+class _Counted(NamedTuple):
+    """How clearly the lowest readings are whole photons and what was added to them, up to 1; its
+    standard error; the signal of a photon in each group of columns."""
 
     score: float
     error: float
     units: Floats
-    known: NDArray[np.bool_]
 
 
 def _counted(
     y: Floats, groups: list[NDArray[np.int64]], units: dict[float, Floats]
-) -> dict[float, _Comb]:
+) -> tuple[dict[float, _Counted], NDArray[np.bool_]]:
     """What whole photons tell where 0, ½ or 1 was added (keys: its negative), near the ``units``
-    by the noise. All are judged by the same groups of columns."""
+    by the noise; in which groups of columns they tell it, the same ones for all."""
     found = {k: unit.copy() for k, unit in units.items()}
     known = np.zeros(len(groups), dtype=np.bool_)
     cosines: dict[float, list[Floats]] = {k: [] for k in units}
@@ -229,7 +228,7 @@ def _counted(
         readings = y[..., columns][np.isfinite(y[..., columns])]
         # The lowest may be what readings without a photon are set to.
         readings = readings[readings > _SAME * readings.min()]
-        lowest = {k: (readings / unit[at]) for k, unit in units.items()}
+        lowest = {k: readings / unit[at] for k, unit in units.items()}
         lowest = {k: x[x < _COUNTED][:_MOST] for k, x in lowest.items()}
         # A few photons more or less fit a longer or shorter step as well.
         if any(x.size < _FEWEST or x.std() < _SEVERAL for x in lowest.values()):
@@ -241,12 +240,12 @@ def _counted(
             best = int(steps.mean(1).argmax())
             found[k][at] *= _NEARBY[best]
             cosines[k].append(steps[best])
-    combs = {}
+    counted = {}
     for k, of in cosines.items():
         every = np.concatenate(of) if of else np.zeros(1)
         error = float(every.std()) / math.sqrt(every.size)
-        combs[k] = _Comb(float(every.mean()), error, found[k], known)
-    return combs
+        counted[k] = _Counted(float(every.mean()), error, found[k])
+    return counted, known
 
 
 def _units(
