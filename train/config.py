@@ -310,6 +310,11 @@ class ObjectiveConfig:
                     f"{getattr(self, name)}"
                 )
             _set(self, **{name: (first, last)})
+        if not self.relative and self.image_bias != (0.0, 0.0):
+            raise ValueError(
+                f"image_bias is a weight within relative, which is 0, got {self.image_bias}: give "
+                "relative a weight, such as 30"
+            )
         low, high = numbers("fidelities", self.fidelities, 2)
         if not 0 <= low <= high <= 1:
             raise ValueError(f"fidelities must be a range within 0 … 1, got {self.fidelities}")

@@ -102,6 +102,11 @@ def test_sections_from_plain_values():
         ("looks: [0, 1]", "unknown key 'looks'"),
         ("objective: {looks: [0, 1], fidelities: [0, 1]}", "looks is the former name of fidelit"),
         ("objective: {data: 0}", "data and relative are both 0"),
+        ("objective: {image_bias: [0, 6]}", "image_bias is a weight within relative"),
+        (
+            "objective: {relative: 30, image_bias: [0, -6]}",
+            "image_bias must be two weights of at least 0",
+        ),
         ("base: nosuch", "base must be one of default, long, quick, short, got 'nosuch'"),
         ("base: [default]", "base must be one of"),
         ("base: default\nlate: {begin: 0.5}", "unknown key 'late.begin'"),
