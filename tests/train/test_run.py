@@ -291,15 +291,14 @@ def test_what_comes_at_the_end_may_change_until_it_begins(tmp_path):
     other = {"begins": 0.75, "scenes": {"core_probability": 0.5}}
     with pytest.raises(ValueError, match=r"late\.scenes\.core_probability"):
         run(tmp_path / "x", stub_config(late=other), resume=True)
+    plain = ObjectiveConfig(relative=1.0, flat=1.0, flat_from=0.75)
     flat = [
-        stub_config(steps=n, decay=0.0, unroll=1, objective=ObjectiveConfig(flat=1.0, flat_from=f))
+        stub_config(steps=n, decay=0.0, unroll=1, objective=replace(plain, flat_from=f))
         for n, f in ((STEPS, 0.75), (2 * STEPS, 0.75), (STEPS, 0.9))
     ]
     run(tmp_path / "y", flat[0], StubObjective({2: send(signal.SIGTERM)}))
-    heavier = replace(flat[0], objective=ObjectiveConfig(flat=2.0, flat_from=0.75))
-    biased = replace(
-        flat[0], objective=ObjectiveConfig(flat=1.0, flat_from=0.75, image_bias=(0.0, 2.0))
-    )
+    heavier = replace(flat[0], objective=replace(plain, flat=2.0))
+    biased = replace(flat[0], objective=replace(plain, image_bias=(0.0, 2.0)))
     for step, changed in ((4, heavier), (6, biased)):
         run(tmp_path / "y", changed, StubObjective({step: send(signal.SIGTERM)}), resume=True)
     run(tmp_path / "y", flat[2], StubObjective({10: send(signal.SIGTERM)}), resume=True)
