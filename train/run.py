@@ -289,7 +289,7 @@ class Run:
             state.best is None
             or score > state.best["score"]
             # A part of the loss that comes later may cost some of the score.
-            or state.best["step"] < (self.config.loss_changes or 0) <= state.step
+            or state.best["step"] <= (self.config.loss_changes or 0) < state.step
         )
         if better:
             state.best = {

@@ -330,7 +330,7 @@ def test_weights_of_a_part_of_the_loss_do_not_ship(tmp_path):
         def validate(self, model, held_out):
             return replace(super().validate(model, held_out), score=-float(self.validations))
 
-    for flat_from, step in ((0.5, 10), (0.0, 5)):
+    for flat_from, step in ((0.5, 10), (5 / STEPS, 10), (0.0, 5)):
         config = stub_config(objective=ObjectiveConfig(flat=1.0, flat_from=flat_from))
         out = tmp_path / str(flat_from)
         run(out, config, Falling())
