@@ -77,6 +77,8 @@ _BACK_S = 300.0
 died is started again, which takes long on a busy machine."""
 _LAST_S = 5.0
 """Between asking processes to end and ending them."""
+_NOTED_S = 0.01
+"""Until it is asked again how a process ended."""
 _SAFE_PATH = "PYTHONSAFEPATH"
 """Environment variable by which Python leaves the current folder out of its path."""
 
@@ -277,8 +279,12 @@ def _children(pool: Pool) -> list[BaseProcess]:
 
 def _how_it_ended(children: Sequence[BaseProcess]) -> str:
     """Signal or status by which a process of :class:`Processes` ended; empty: it is not known."""
+    until = time.monotonic() + _LAST_S
     for child in children:
-        child.join(_LAST_S)  # it is known when the system has handed it over
+        child.join(_LAST_S)
+        # The pool waits for it, too: who comes second is told nothing until the first has noted it.
+        while child.exitcode is None and time.monotonic() < until:
+            time.sleep(_NOTED_S)
         code = child.exitcode or 0
         if code > 0:
             return f"status {code}"

@@ -363,6 +363,24 @@ def test_a_job_whose_process_dies_is_repeated_and_left_out_after_three(
     assert "noted" not in capfd.readouterr().err
 
 
+def test_how_a_process_ended_is_waited_for():
+    """Two threads wait for a process: who comes second is told nothing until the first has noted
+    it."""
+
+    class Child:
+        def __init__(self):
+            self.told = [None, None, -signal.SIGKILL, -signal.SIGKILL]
+
+        def join(self, timeout):
+            pass
+
+        @property
+        def exitcode(self):
+            return self.told.pop(0)
+
+    assert execute._how_it_ended([Child()]).startswith("SIGKILL")
+
+
 @pytest.mark.extended
 @pytest.mark.slow
 @pytest.mark.cluster
