@@ -255,7 +255,9 @@ class ObjectiveConfig:
             which ``flat`` and ``image_bias`` count.
         relative: of ‖e‖² over that of the filtered view, with the same weights of places.
         image_bias: by how much more than the variance the squared bias of each voxel counts in
-            ``relative``, at fidelity 0 and at fidelity 1, linear between.
+            ``relative``, at fidelity 0 and at fidelity 1, linear between; faint_hu: spread of the
+            truth about a voxel at which it counts half as much as where all is constant, HU; 0: it
+            counts alike everywhere.
         noise_free: of these of the same scene without noise, against those with noise: what is left
             there is blur and overshoot.
         contrast: of the ROI contrasts' errors at fidelity 1; viewing: share of it that is left at
@@ -277,6 +279,7 @@ class ObjectiveConfig:
     flat_from: float = 0.0
     relative: float = 0.0
     image_bias: tuple[float, float] = (0.0, 0.0)
+    faint_hu: float = 0.0
     noise_free: float = 0.0
     contrast: float = 0.2
     viewing: float = 1.0
@@ -293,6 +296,7 @@ class ObjectiveConfig:
             "body",
             "flat",
             "relative",
+            "faint_hu",
             "noise_free",
             "contrast",
         ):

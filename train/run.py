@@ -204,6 +204,7 @@ class Run:
                 "objective.flat",
                 "objective.flat_from",
                 "objective.image_bias",
+                "objective.faint_hu",
             }
         if reached <= min(self.config.late_begins, before.late_begins):
             other = {name for name in other if not name.startswith("late.")}

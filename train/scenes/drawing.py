@@ -116,7 +116,18 @@ def _draw(draw: Draw, extent: Triple, config: SceneConfig) -> TrainingScene:
     if draw.chance(config.motion_probability):
         size, angle = draw(config.motion), draw.angle()
         motion = (size * abs(math.sin(angle)), size * abs(math.cos(angle)))
-    return replace(scene, textures=tuple(textures), blur=draw(config.blur), motion=motion)
+    scene = replace(scene, textures=tuple(textures), blur=draw(config.blur), motion=motion)
+    # Drawn last, and without a number of its own where there are none: scenes without them are
+    # those of configurations that do not know them.
+    if scene.vessels and config.small_probability and draw.chance(config.small_probability):
+        small = tuple(
+            _free_body(draw, extent, config, background, config.free_contrast, config.nodule_size)
+            for _ in range(draw.count(1, 4))
+        )
+        scene = replace(
+            scene, solids=(*scene.solids, *(replace(body, displaces=OUTSIDE) for body in small))
+        )
+    return scene
 
 
 def _second_tissue(
@@ -161,28 +172,31 @@ def _free_bodies(
     contrast = (
         config.wide_contrast if draw.chance(config.wide_probability) else config.free_contrast
     )
-    bodies = []
-    for _ in range(draw.count(*config.free_count)):
-        shape = ("ellipsoid", "superquadric", "tube")[draw.count(0, 2)]
-        axes = draw.axes(config.free_size)
-        if shape == "tube":
-            # An ellipsoid longer than any inset: a body of slowly varying section.
-            axes = (*axes[:2], 5.0 * max(extent))
-        x, y, z = (draw((-0.5 * e, 0.5 * e)) for e in extent[::-1])
-        bodies.append(
-            Solid(
-                Tissue.INSERT,
-                background + draw(contrast),
-                (x, y, z),
-                axes,
-                tuple(Tissue),
-                exponent=draw.log(config.exponent) if shape == "superquadric" else 2.0,
-                rotation=draw.rotation(),
-                kind="free",
-            )
-        )
-    return TrainingScene(
-        background, solids=tuple(bodies), signal=Tissue.INSERT, around=Tissue.BACKGROUND
+    bodies = tuple(
+        _free_body(draw, extent, config, background, contrast, config.free_size)
+        for _ in range(draw.count(*config.free_count))
+    )
+    return TrainingScene(background, solids=bodies, signal=Tissue.INSERT, around=Tissue.BACKGROUND)
+
+
+def _free_body(
+    draw: Draw, extent: Triple, config: SceneConfig, background: float, contrast: Range, size: Range
+) -> Solid:
+    shape = ("ellipsoid", "superquadric", "tube")[draw.count(0, 2)]
+    axes = draw.axes(size)
+    if shape == "tube":
+        # An ellipsoid longer than any inset: a body of slowly varying section.
+        axes = (*axes[:2], 5.0 * max(extent))
+    x, y, z = (draw((-0.5 * e, 0.5 * e)) for e in extent[::-1])
+    return Solid(
+        Tissue.INSERT,
+        background + draw(contrast),
+        (x, y, z),
+        axes,
+        tuple(Tissue),
+        exponent=draw.log(config.exponent) if shape == "superquadric" else 2.0,
+        rotation=draw.rotation(),
+        kind="free",
     )
 
 

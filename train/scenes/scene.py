@@ -78,6 +78,8 @@ class SceneConfig:
             free_size: their number, contrast to the background, and semi-axes (log-uniform);
             wide_probability: of free bodies with wide_contrast instead, like bone, air or contrast
             agent.
+        small_probability: of 1 to 4 free bodies in a scene of vessels, too, of free_contrast and as
+            small as nodules; they lie in the background and in the tissue beside.
         beside_probability: of fat beside muscle, or muscle beside fat, behind the vessels or
             bodies; beside_distance: of its face from the wall of the first vessel; beside_size:
             semi-axes (log-uniform) of the ellipsoid in which it lies, so large that the inset sees
@@ -140,6 +142,7 @@ class SceneConfig:
     free_size: Size = (0.3, 3.0)
     wide_probability: Probability = 0.3
     wide_contrast: Range = (-900.0, 1500.0)
+    small_probability: Probability = 0.0
     beside_probability: Probability = 0.45
     beside_distance: Range = (-0.3, 4.0)
     beside_size: Size = (5.0, 40.0)
