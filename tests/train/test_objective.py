@@ -106,6 +106,40 @@ def test_bias_of_the_image_is_what_both_draws_share(data):
         assert total(sign, 1.0, (1.0, 4.0), progress=0.4) == pytest.approx(plain)
 
 
+def test_where_contrasts_are_strong_bias_counts_less(data):
+    """Half as much where the truth spreads by ``faint_hu``; where it is constant, as elsewhere."""
+    batch = data.batch(0, 4, range(1))
+    _, (_, _, smoothed) = truth_of(batch), batch.views
+    assert smoothed is not None
+    step = torch.zeros_like(batch.truth)
+    step[..., 8:] = 200.0
+    options = {"data": 0.0, "relative": 3.0, "contrast": 0.0, "edge": 0.0, "fidelities": (1.0, 1.0)}
+
+    def bias(truth, columns, faint):
+        drawn = replace(batch, truth=truth)
+        error = torch.zeros_like(drawn.truth)
+        error[..., columns] = 0.1
+        given = Given(truth_of(drawn) + torch.cat([error, error]))
+        totals = [
+            float(
+                Objective(ObjectiveConfig(image_bias=(0.0, weight), faint_hu=faint, **options))(
+                    given, drawn, 1.0
+                ).total
+            )
+            for weight in (0.0, 4.0)
+        ]
+        return totals[1] - totals[0]
+
+    for truth, columns, share in (
+        (step, slice(6, 10), 0.5),
+        (step, slice(12, 16), 1.0),
+        (0.5 * step, slice(6, 10), 2.0 / 3.0),
+    ):
+        everywhere = bias(truth, columns, 0.0)
+        assert everywhere > 0
+        assert bias(truth, columns, 200.0) == pytest.approx(share * everywhere, rel=1e-3)
+
+
 def test_without_a_filtered_view_the_step_towards_the_data_is_the_measure(data):
     batch = data.batch(0, 4, range(2))
     truth, (first, towards, _) = truth_of(batch), batch.views

@@ -124,6 +124,28 @@ def test_what_many_scenes_hold() -> None:
         assert (p.signal + p.around).max() <= 1 + 1e-5
 
 
+def test_small_bodies_beside_vessels_leave_the_rest_as_it_is() -> None:
+    """They are as small as nodules, displace no vessel, and are there as often as asked for."""
+    plain, with_small = SceneConfig(), SceneConfig(small_probability=0.5, nodule_size=(0.3, 0.5))
+    number, of_vessels = 0, 0
+    for seed in range(100):
+        scene, other = draw_scene(seed, EXTENT, with_small), draw_scene(seed, EXTENT, plain)
+        if not other.vessels:
+            assert scene.solids == other.solids
+            continue
+        small = [s for s in scene.solids if s.kind == "free"]
+        assert len(small) <= 4
+        of_vessels, number = of_vessels + 1, number + bool(small)
+        for body in small:
+            assert max(sorted(body.semi_axes)[:2]) <= 0.5
+            assert set(body.displaces) == {Tissue.BACKGROUND, Tissue.BESIDE}
+            assert -150.0 <= body.hu - scene.background <= 300.0
+        if not small:
+            assert scene.blur == other.blur
+            assert [s.kind for s in scene.solids] == [s.kind for s in other.solids]
+    assert 0.35 * of_vessels < number < 0.65 * of_vessels
+
+
 @pytest.mark.parametrize("axes", [(0.6, 0.6, 0.6), (0.4, 0.9, 1.4), (0.3, 0.5, 2.0)])
 def test_ellipsoid_has_its_volume_at_any_offset(axes: tuple) -> None:
     rng = np.random.default_rng(5)
