@@ -252,12 +252,10 @@ class ObjectiveConfig:
         white: of ‖e‖², against ``data``; edge: by how much more within two voxels of an edge; body:
             in bodies and one voxel about them; flat: in bodies, where the truth is constant for
             two voxels around, such as deep in a lumen; flat_from: share of the training after
-            which ``flat`` and ``image_bias`` count.
+            which ``flat`` and ``lesion_bias`` count.
         relative: of ‖e‖² over that of the filtered view, with the same weights of places.
-        image_bias: by how much more than the variance the squared bias of each voxel counts in
-            ``relative``, at fidelity 0 and at fidelity 1, linear between; faint_hu: spread of the
-            truth about a voxel at which it counts half as much as where all is constant, HU; 0: it
-            counts alike everywhere.
+        lesion_bias: by how much more than the variance the squared bias of each voxel of a lesion
+            counts in ``relative``, at fidelity 0 and at fidelity 1, linear between.
         noise_free: of these of the same scene without noise, against those with noise: what is left
             there is blur and overshoot.
         contrast: of the ROI contrasts' errors at fidelity 1; viewing: share of it that is left at
@@ -278,8 +276,7 @@ class ObjectiveConfig:
     flat: float = 0.0
     flat_from: float = 0.0
     relative: float = 0.0
-    image_bias: tuple[float, float] = (0.0, 0.0)
-    faint_hu: float = 0.0
+    lesion_bias: tuple[float, float] = (0.0, 0.0)
     noise_free: float = 0.0
     contrast: float = 0.2
     viewing: float = 1.0
@@ -296,7 +293,6 @@ class ObjectiveConfig:
             "body",
             "flat",
             "relative",
-            "faint_hu",
             "noise_free",
             "contrast",
         ):
@@ -306,7 +302,7 @@ class ObjectiveConfig:
         _set(self, flat_from=number("flat_from", self.flat_from, low=0.0, high=1.0))
         _set(self, viewing=number("viewing", self.viewing, low=0.0, high=1.0))
         _set(self, contrast_sd=number("contrast_sd", self.contrast_sd, positive=True))
-        for name in ("bias", "image_bias"):
+        for name in ("bias", "lesion_bias"):
             first, last = numbers(name, getattr(self, name), 2)
             if not (first >= 0 and last >= 0):
                 raise ValueError(
@@ -314,9 +310,9 @@ class ObjectiveConfig:
                     f"{getattr(self, name)}"
                 )
             _set(self, **{name: (first, last)})
-        if not self.relative and self.image_bias != (0.0, 0.0):
+        if not self.relative and self.lesion_bias != (0.0, 0.0):
             raise ValueError(
-                f"image_bias is a weight within relative, which is 0, got {self.image_bias}: give "
+                f"lesion_bias is a weight within relative, which is 0, got {self.lesion_bias}: give "
                 "relative a weight, such as 30"
             )
         low, high = numbers("fidelities", self.fidelities, 2)
@@ -450,7 +446,7 @@ class TrainConfig:
     def loss_changes(self) -> int | None:
         """The first step with all parts of the loss; None if all steps have them."""
         o = self.objective
-        later = bool(o.flat) or o.image_bias != (0.0, 0.0)
+        later = bool(o.flat) or o.lesion_bias != (0.0, 0.0)
         return round(self.steps * o.flat_from) if later else None
 
     @property

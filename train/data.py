@@ -64,7 +64,7 @@ VOLUMES = 3
 BODY_HU = 15.0
 """What differs by more from the background is a body; where values differ by more there is an
 edge."""
-FORMAT = "torchpcct training views 1"
+FORMAT = "torchpcct training views 2"
 """What kept views say of themselves."""
 _REACH = 2
 """Voxels about one in which the truth is constant, or an edge."""
@@ -78,6 +78,10 @@ _EDGE = 4
 """Bit of a scene's labels: near an edge."""
 _BODY = 8
 """Bit of a scene's labels: in or near a body."""
+_LESION = 16
+"""Bit of a scene's labels: what is no vessel, tissue or stent shows there."""
+_LESION_HU = 5.0
+"""By how much it differs there from the scene without."""
 _PIECE = 64
 """Scenes that a process paints before it gives them back."""
 _LEFT_FREE = 0.4
@@ -118,8 +122,8 @@ class Batch:
         problem: of ``3 · size`` volumes: the first draws of all scenes, the second ones, no noise.
         views: of the problem, :func:`recon.mbir.unrolled.first_views`.
         truth: ``(size, z, y, x)`` HU above the background.
-        edges, bodies: ``(size, z, y, x)``, 1 near edges of the truth, and in bodies and one voxel
-            about them, else 0.
+        edges, bodies, lesions: ``(size, z, y, x)``, 1 near edges of the truth, in bodies and one
+            voxel about them, and where a lesion is seen, else 0.
         contrast: ``(size, rois, z, y, x)`` weights of ROI contrasts: mean over a core (or of plain
             tissue) less mean over the tissue around it, random small parts of both, last all of
             both; 0 where the scene offers none.
@@ -134,6 +138,7 @@ class Batch:
     truth: Tensor
     edges: Tensor
     bodies: Tensor
+    lesions: Tensor
     contrast: Tensor
     voxels: Tensor
     lots: Tensor
@@ -399,6 +404,7 @@ class Data:
             truth,
             (labels & _EDGE > 0).float(),
             (labels & _BODY > 0).float(),
+            (labels & _LESION > 0).float(),
             contrast,
             voxels,
             random[:, :2],
@@ -474,6 +480,9 @@ def painted(config: DataConfig, seed: int) -> tuple[Tensor, Tensor, Tensor]:
     truth = torch.from_numpy(found.image) - scene.background
     signal, around = torch.from_numpy(found.signal) > 0.97, torch.from_numpy(found.around) > 0.97
     labels = _SIGNAL * signal + _AROUND * around + _EDGE * _edges(truth) + _BODY * _bodies(truth)
+    healthy = rasterise(scene.without_lesions(), (nz, ny, nx), config.voxel_mm)
+    lesions = np.abs(found.image - healthy.image) > _LESION_HU
+    labels = labels + _LESION * torch.from_numpy(lesions)
     return torch.from_numpy(found.data) - scene.background, truth, labels.to(torch.uint8)
 
 

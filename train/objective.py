@@ -12,11 +12,10 @@ with errors e₁, e₂ in noise units:
 * ``relative``: the same over that of the filtered view of the same data, so that scenes count
   alike: their squared errors differ by far more than one power of ten, and the largest decide a
   step. With it fewer steps are needed for the same error (``train/experiments.md``);
-* ``image_bias``: e₁ᵀe₂ per voxel, over the same. As the draws are independent, its mean is the
-  squared bias, so κ trades variance against bias in every voxel: small and faint bodies, which are
-  nothing beside the error of edges, are shown instead of smoothed away; with ``faint_hu`` the less
-  the more contrast there is about a voxel, so that strong edges, whose bias is larger than all
-  else, do not decide how much noise there is;
+* ``lesion_bias``: e₁ᵀe₂ per voxel where the scene holds a lesion, over the same. As the draws are
+  independent, its mean is the squared bias, so κ trades variance against bias there: small and
+  faint bodies, which are nothing beside the error of edges, are shown instead of smoothed away. In
+  every voxel it would be the bias of strong edges that decides;
 * ``noise_free``: all of these of the same scene without noise, where all that is left is blur and
   overshoot beside edges;
 * ``contrast``: the errors d of ROI contrasts, small ones and that of a whole core, (d₁² + d₂²) / 2
@@ -139,9 +138,8 @@ class Objective:
         truth = batch.truth[scene] / problem.unit_hu.reshape(-1, 1, 1, 1)
         error = made - truth
         places = c.edge * batch.edges + c.body * batch.bodies
-        contrasts = spread(batch.truth)
         if c.flat and progress >= c.flat_from:
-            places = places + c.flat * batch.bodies * (contrasts < _FLAT_HU)
+            places = places + c.flat * batch.bodies * (spread(batch.truth) < _FLAT_HU)
         counts = 1.0 + places[scene]
         white = (error.square() * counts).mean(dim=(1, 2, 3))
         image, data, bias = torch.zeros_like(white), None, torch.zeros_like(white[0])
@@ -153,11 +151,11 @@ class Objective:
             of_view = ((towards if smoothed is None else smoothed) - truth).square()
             measure = (of_view * counts).mean(dim=(1, 2, 3)).clamp_min(_LEAST_ERROR)
             image = image + c.relative * white / measure
-            if c.image_bias != (0.0, 0.0) and progress >= c.flat_from:
-                faint = 1.0 / (1.0 + contrasts / c.faint_hu) if c.faint_hu else 1.0
-                both = (error[:n] * error[n : 2 * n] * counts[:n] * faint).mean(dim=(1, 2, 3))
+            if c.lesion_bias != (0.0, 0.0) and progress >= c.flat_from:
+                there = counts[:n] * batch.lesions
+                both = (error[:n] * error[n : 2 * n] * there).mean(dim=(1, 2, 3))
                 shared = both / (measure[:n] * measure[n : 2 * n]).sqrt()
-                bias = c.relative * (_between(c.image_bias, fidelity) * shared).sum()
+                bias = c.relative * (_between(c.lesion_bias, fidelity) * shared).sum()
         noisy, error = image[: 2 * n], error[: 2 * n]
         # The noise of an ROI mean falls with its size, but less than as 1/√voxels: neighbours are
         # correlated.

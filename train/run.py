@@ -203,8 +203,7 @@ class Run:
                 "final_fraction",
                 "objective.flat",
                 "objective.flat_from",
-                "objective.image_bias",
-                "objective.faint_hu",
+                "objective.lesion_bias",
             }
         if reached <= min(self.config.late_begins, before.late_begins):
             other = {name for name in other if not name.startswith("late.")}

@@ -22,7 +22,7 @@ contrasts of 0.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from typing import Any, TypeAlias
 
@@ -474,6 +474,12 @@ class TrainingScene:
     motion: tuple[float, float] = (0.0, 0.0)
     signal: Tissue = Tissue.CORE
     around: Tissue = Tissue.LAYER
+
+    def without_lesions(self) -> TrainingScene:
+        """The same vessels and stents in the same tissues, without what else there is: cores,
+        calcifications, ulcers, thrombi, flaps, inflamed fat, nodules, strands and free bodies."""
+        tissue = tuple(body for body in self.beside if body.tissue is Tissue.BESIDE)
+        return replace(self, beside=tissue, cores=(), solids=(), halos=())
 
 
 def is_paper_family(scene: TrainingScene) -> bool:
