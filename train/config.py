@@ -312,8 +312,8 @@ class ObjectiveConfig:
             _set(self, **{name: (first, last)})
         if not self.relative and self.lesion_bias != (0.0, 0.0):
             raise ValueError(
-                f"lesion_bias is a weight within relative, which is 0, got {self.lesion_bias}: give "
-                "relative a weight, such as 30"
+                f"lesion_bias is a weight within relative, which is 0, got {self.lesion_bias}: "
+                "give relative a weight, such as 30"
             )
         low, high = numbers("fidelities", self.fidelities, 2)
         if not 0 <= low <= high <= 1:

@@ -102,10 +102,10 @@ def test_sections_from_plain_values():
         ("looks: [0, 1]", "unknown key 'looks'"),
         ("objective: {looks: [0, 1], fidelities: [0, 1]}", "looks is the former name of fidelit"),
         ("objective: {data: 0}", "data and relative are both 0"),
-        ("objective: {image_bias: [0, 6]}", "image_bias is a weight within relative"),
+        ("objective: {lesion_bias: [0, 6]}", "lesion_bias is a weight within relative"),
         (
-            "objective: {relative: 30, image_bias: [0, -6]}",
-            "image_bias must be two weights of at least 0",
+            "objective: {relative: 30, lesion_bias: [0, -6]}",
+            "lesion_bias must be two weights of at least 0",
         ),
         ("base: nosuch", "base must be one of default, long, quick, short, got 'nosuch'"),
         ("base: [default]", "base must be one of"),

@@ -12,7 +12,7 @@ import torch
 
 from recon.mbir.unrolled import first_views
 from train.config import DataConfig, Situation
-from train.data import ROIS, Data, InTurn, Views, turn
+from train.data import ROIS, Data, InTurn, Views, painted, turn
 
 CONFIG = DataConfig(
     shape=(16, 12, 12),
@@ -30,6 +30,31 @@ def data(tmp_path_factory):
     return Data(CONFIG, 3, tmp_path_factory.mktemp("views"))
 
 
+def test_lesions_are_where_the_scene_differs_from_the_healthy_one():
+    """Free bodies in plain fat are all that is there; healthy vessels have no lesion."""
+    plain = {"beside_probability": 0.0, "texture_probability": 0.0, "blur": (0.0, 0.0)}
+    healthy = {"free_probability": 0.0, "core_probability": 0.0} | {
+        f"{kind}_probability": 0.0
+        for kind in [
+            "ulcer",
+            "thrombus",
+            "flap",
+            "calcification",
+            "occlusion",
+            "halo",
+            "strand",
+            "nodule",
+        ]
+    }
+    for seed in range(3):
+        scenes = plain | {"free_probability": 1.0}
+        _, truth, labels = painted(replace(CONFIG, scenes=scenes), seed)
+        assert torch.equal(labels & 16 > 0, truth.abs() > 5.0)
+        _, truth, labels = painted(replace(CONFIG, scenes=plain | healthy), seed)
+        assert truth.abs().max() > 50.0
+        assert not (labels & 16).any()
+
+
 def test_pure_function_of_seed_step_and_index(data, tmp_path):
     """Also where the views come from another file."""
     whole = data.batch(5, BATCH, range(4))
@@ -38,7 +63,7 @@ def test_pure_function_of_seed_step_and_index(data, tmp_path):
     part = again.batch(5, BATCH, [2, 0])
     assert whole.size == 4
     assert whole.problem.b.shape == (12, *CONFIG.shape)
-    for name in ("truth", "contrast", "voxels", "lots", "edges", "bodies"):
+    for name in ("truth", "contrast", "voxels", "lots", "edges", "bodies", "lesions"):
         assert torch.equal(getattr(whole, name)[[2, 0]], getattr(part, name)), name
     assert torch.equal(whole.problem.b[[2, 0, 6, 4, 10, 8]], part.problem.b)
     assert not torch.equal(whole.truth, data.batch(4, BATCH, range(4)).truth)

@@ -298,7 +298,7 @@ def test_what_comes_at_the_end_may_change_until_it_begins(tmp_path):
     ]
     run(tmp_path / "y", flat[0], StubObjective({2: send(signal.SIGTERM)}))
     heavier = replace(flat[0], objective=replace(plain, flat=2.0))
-    biased = replace(flat[0], objective=replace(plain, image_bias=(0.0, 2.0)))
+    biased = replace(flat[0], objective=replace(plain, lesion_bias=(0.0, 2.0)))
     for step, changed in ((4, heavier), (6, biased)):
         run(tmp_path / "y", changed, StubObjective({step: send(signal.SIGTERM)}), resume=True)
     run(tmp_path / "y", flat[2], StubObjective({10: send(signal.SIGTERM)}), resume=True)

@@ -146,6 +146,21 @@ def test_small_bodies_beside_vessels_leave_the_rest_as_it_is() -> None:
     assert 0.35 * of_vessels < number < 0.65 * of_vessels
 
 
+def test_a_scene_without_its_lesions_is_a_healthy_one() -> None:
+    """Vessels, stents and the tissue beside them are as they were, and nothing else is left."""
+    seen: Counter[str] = Counter()
+    for seed in range(40):
+        scene = draw_scene(seed, EXTENT, SceneConfig(small_probability=0.5))
+        healthy = scene.without_lesions()
+        for name in ("background", "vessels", "stents", "textures", "blur", "motion"):
+            assert getattr(healthy, name) is getattr(scene, name)
+        assert (healthy.cores, healthy.solids, healthy.halos) == ((), (), ())
+        assert {body.kind for body in healthy.beside} <= {"beside"}
+        seen += Counter(body.kind for body in scene.beside if body not in healthy.beside)
+        seen["tissue"] += len(healthy.beside)
+    assert min(seen[kind] for kind in ("tissue", "nodule", "strand")) > 0
+
+
 @pytest.mark.parametrize("axes", [(0.6, 0.6, 0.6), (0.4, 0.9, 1.4), (0.3, 0.5, 2.0)])
 def test_ellipsoid_has_its_volume_at_any_offset(axes: tuple) -> None:
     rng = np.random.default_rng(5)
