@@ -479,10 +479,10 @@ def painted(config: DataConfig, seed: int) -> tuple[Tensor, Tensor, Tensor]:
     found = rasterise(scene, (nz, ny, nx), config.voxel_mm)
     truth = torch.from_numpy(found.image) - scene.background
     signal, around = torch.from_numpy(found.signal) > 0.97, torch.from_numpy(found.around) > 0.97
-    labels = _SIGNAL * signal + _AROUND * around + _EDGE * _edges(truth) + _BODY * _bodies(truth)
     healthy = rasterise(scene.without_lesions(), (nz, ny, nx), config.voxel_mm)
-    lesions = np.abs(found.image - healthy.image) > _LESION_HU
-    labels = labels + _LESION * torch.from_numpy(lesions)
+    lesions = torch.from_numpy(np.abs(found.image - healthy.image)) > _LESION_HU
+    labels = _SIGNAL * signal + _AROUND * around + _LESION * lesions
+    labels = labels + _EDGE * _edges(truth) + _BODY * _bodies(truth)
     return torch.from_numpy(found.data) - scene.background, truth, labels.to(torch.uint8)
 
 
