@@ -100,11 +100,14 @@ def test_bias_of_lesions_is_what_both_draws_share(data):
         config = ObjectiveConfig(lesion_bias=bias, fidelities=(fidelity, fidelity), **options)
         return float(Objective(config)(Given(truth + both), batch, progress).total)
 
+    measure = (smoothed[:4] - truth).square().mean((1, 2, 3))
+    there = (error.square() * batch.lesions).mean((1, 2, 3))
+    expected = 3.0 * float((there / (measure[:2] * measure[2:]).sqrt()).sum())
     beside = error * (1.0 - batch.lesions)
     for sign in (1.0, -1.0):
         plain = total(sign, 1.0, (0.0, 0.0))
         shared = total(sign, 1.0, (0.0, 1.0)) - plain
-        assert sign * shared > 0.1 * plain
+        assert sign * shared == pytest.approx(expected, rel=1e-3)
         assert total(sign, 1.0, (1.0, 4.0)) - plain == pytest.approx(4.0 * shared, rel=1e-4)
         assert total(sign, 0.0, (1.0, 4.0)) - plain == pytest.approx(shared, rel=1e-4)
         assert total(sign, 1.0, (1.0, 4.0), progress=0.4) == pytest.approx(plain)
