@@ -48,6 +48,8 @@ _MERGED = ("data", "late", "objective")
 """Sections that a file with a ``base`` gives in part."""
 OPTIMISERS = ("adam", "soap")
 """Names of the optimisers."""
+_FORMER_NAMES = {"looks": "fidelities", "relative": "image", "bias": "contrast_bias"}
+"""Of parts of the loss, which older files have, and what they are called now."""
 VALIDATED_AT_ONCE = 4
 """Scenes that a validation reconstructs at a time."""
 
@@ -73,10 +75,11 @@ def _section(cls: type[C], values: object, where: str) -> C:
     if not isinstance(values, Mapping):
         raise ValueError(f"{label} must be a mapping of names to values, got {values!r}")
     known = [f.name for f in fields(cls)]
-    if "looks" in values and "fidelities" in known:  # its former name
-        if "fidelities" in values:
-            raise ValueError(f"{label}: looks is the former name of fidelities: leave one out")
-        values = {"fidelities" if k == "looks" else k: v for k, v in values.items()}
+    for former, name in _FORMER_NAMES.items():
+        if former in values and name in known:
+            if name in values:
+                raise ValueError(f"{label}: {former} is the former name of {name}: leave one out")
+            values = {name if k == former else k: v for k, v in values.items()}
     for key in values:
         if key not in known:
             name = f"{where}.{key}" if where else str(key)
@@ -248,19 +251,17 @@ class ObjectiveConfig:
     """Weights of the terms of :mod:`train.objective` and size of the validation.
 
     Args:
-        data: of eᵀH e; 0: neither that nor ``white``.
-        white: of ‖e‖², against ``data``; edge: by how much more within two voxels of an edge; body:
-            in bodies and one voxel about them; flat: in bodies, where the truth is constant for
-            two voxels around, such as deep in a lumen; flat_from: share of the training after
-            which ``flat`` and ``lesion_bias`` count.
-        relative: of ‖e‖² over that of the filtered view, with the same weights of places.
+        image: of ‖e‖² over that of the filtered view; edge: by how much more a voxel counts in both
+            within two voxels of an edge; body: in bodies and one voxel about them; flat: in bodies,
+            where the truth is constant for two voxels around, such as deep in a lumen; flat_from:
+            share of the training after which ``flat`` and ``lesion_bias`` count.
         lesion_bias: by how much more than the variance the squared bias of each voxel of a lesion
-            counts in ``relative``, at fidelity 0 and at fidelity 1, linear between.
-        noise_free: of these of the same scene without noise, against those with noise: what is left
-            there is blur and overshoot.
+            counts in ``image``, at fidelity 0 and at fidelity 1, linear between.
+        noise_free: of ``image`` of the same scene without noise, against those with noise: what is
+            left there is blur and overshoot.
         contrast: of the ROI contrasts' errors at fidelity 1; viewing: share of it that is left at
             fidelity 0, linear between.
-        bias: κ at fidelity 0 and at fidelity 1, linear between.
+        contrast_bias: κ at fidelity 0 and at fidelity 1, linear between.
         contrast_sd: an ROI contrast error, in noise units, that counts as 1.
         fidelities: range of the fidelity, uniform.
         held_out: scenes of the validation, of another seed than those of the training.
@@ -269,40 +270,28 @@ class ObjectiveConfig:
         TypeError, ValueError: a value is out of its range.
     """
 
-    data: float = 60.0
-    white: float = 0.2
+    image: float = 30.0
     edge: float = 2.0
     body: float = 0.0
     flat: float = 0.0
     flat_from: float = 0.0
-    relative: float = 0.0
     lesion_bias: tuple[float, float] = (0.0, 0.0)
     noise_free: float = 0.0
     contrast: float = 0.2
     viewing: float = 1.0
-    bias: tuple[float, float] = (1.0, 1.0)
+    contrast_bias: tuple[float, float] = (1.0, 1.0)
     contrast_sd: float = 0.15
     fidelities: tuple[float, float] = (0.0, 1.0)
     held_out: int = 64
 
     def __post_init__(self) -> None:
-        for name in (
-            "data",
-            "white",
-            "edge",
-            "body",
-            "flat",
-            "relative",
-            "noise_free",
-            "contrast",
-        ):
+        for name in ("edge", "body", "flat", "noise_free", "contrast"):
             _set(self, **{name: number(name, getattr(self, name), low=0.0)})
-        if not self.data and not self.relative:
-            raise ValueError("data and relative are both 0: nothing is left of the image's error")
+        _set(self, image=number("image", self.image, positive=True))
         _set(self, flat_from=number("flat_from", self.flat_from, low=0.0, high=1.0))
         _set(self, viewing=number("viewing", self.viewing, low=0.0, high=1.0))
         _set(self, contrast_sd=number("contrast_sd", self.contrast_sd, positive=True))
-        for name in ("bias", "lesion_bias"):
+        for name in ("contrast_bias", "lesion_bias"):
             first, last = numbers(name, getattr(self, name), 2)
             if not (first >= 0 and last >= 0):
                 raise ValueError(
@@ -310,11 +299,6 @@ class ObjectiveConfig:
                     f"{getattr(self, name)}"
                 )
             _set(self, **{name: (first, last)})
-        if not self.relative and self.lesion_bias != (0.0, 0.0):
-            raise ValueError(
-                f"lesion_bias is a weight within relative, which is 0, got {self.lesion_bias}: "
-                "give relative a weight, such as 30"
-            )
         low, high = numbers("fidelities", self.fidelities, 2)
         if not 0 <= low <= high <= 1:
             raise ValueError(f"fidelities must be a range within 0 … 1, got {self.fidelities}")
@@ -447,7 +431,9 @@ class TrainConfig:
         """The first step with all parts of the loss; None if all steps have them."""
         o = self.objective
         later = bool(o.flat) or o.lesion_bias != (0.0, 0.0)
-        return round(self.steps * o.flat_from) if later else None
+        first = math.floor(self.steps * o.flat_from)
+        first += first / self.steps < o.flat_from  # as the loss compares its progress
+        return first if later else None
 
     @property
     def late_begins(self) -> int:

@@ -4,19 +4,16 @@ A plain squared error teaches a network to shrink what it is unsure of: the erro
 contrast with it. So there are several terms, all from two independent noise draws of each scene
 with errors e₁, e₂ in noise units:
 
-* ``data``: eᵀH e per voxel, the error as the scanner would see it, which is the noise-whitened
-  squared error;
-* ``white``: ‖e‖² per voxel, for the frequencies that the scanner does not see; more on both sides
-  of edges, where blur and undershoot are, and in bodies, which are small beside what surrounds
-  them; more again deep in wide bodies, where no contrast can be lost and noise alone is left;
-* ``relative``: the same over that of the filtered view of the same data, so that scenes count
-  alike: their squared errors differ by far more than one power of ten, and the largest decide a
-  step. With it fewer steps are needed for the same error (``train/experiments.md``);
+* ``image``: ‖e‖² over that of the filtered view of the same data, so that scenes count alike: their
+  squared errors differ by far more than one power of ten, and the largest would decide a step
+  (``train/experiments.md``); more on both sides of edges, where blur and undershoot are, and in
+  bodies, which are small beside what surrounds them; more again deep in wide bodies, where no
+  contrast can be lost and noise alone is left;
 * ``lesion_bias``: e₁ᵀe₂ per voxel where the scene holds a lesion, over the same. As the draws are
   independent, its mean is the squared bias, so κ trades variance against bias there: small and
   faint bodies, which are nothing beside the error of edges, are shown instead of smoothed away. In
   every voxel it would be the bias of strong edges that decides;
-* ``noise_free``: all of these of the same scene without noise, where all that is left is blur and
+* ``noise_free``: ``image`` of the same scene without noise, where all that is left is blur and
   overshoot beside edges;
 * ``contrast``: the errors d of ROI contrasts, small ones and that of a whole core, (d₁² + d₂²) / 2
   + κ d₁ d₂. The product of two draws is an unbiased estimate of the squared bias, so κ trades
@@ -45,9 +42,6 @@ from recon.mbir.unrolled import DEFAULT_FIDELITY, Views
 from train.config import VALIDATED_AT_ONCE, ObjectiveConfig
 from train.data import Batch, Data, spread
 
-_TAME_ERROR = 0.02
-"""Squared errors beyond count less than their size: a few scenes (calcifications at high dose)
-would drown all others."""
 _LEAST_ERROR = 1e-4
 """Mean squared error of a filtered view, in noise units, that counts at least: of what is nearly
 empty and without noise nothing is to be learned."""
@@ -141,42 +135,33 @@ class Objective:
         if c.flat and progress >= c.flat_from:
             places = places + c.flat * batch.bodies * (spread(batch.truth) < _FLAT_HU)
         counts = 1.0 + places[scene]
-        white = (error.square() * counts).mean(dim=(1, 2, 3))
-        image, data, bias = torch.zeros_like(white), None, torch.zeros_like(white[0])
-        if c.data:
-            data = (error * problem.apply(error)).mean(dim=(1, 2, 3))
-            image = c.data * (data + c.white * white) / (1.0 + data.detach() / _TAME_ERROR)
-        if c.relative:
-            _, towards, smoothed = views
-            of_view = ((towards if smoothed is None else smoothed) - truth).square()
-            measure = (of_view * counts).mean(dim=(1, 2, 3)).clamp_min(_LEAST_ERROR)
-            image = image + c.relative * white / measure
-            if c.lesion_bias != (0.0, 0.0) and progress >= c.flat_from:
-                there = counts[:n] * batch.lesions
-                both = (error[:n] * error[n : 2 * n] * there).mean(dim=(1, 2, 3))
-                shared = both / (measure[:n] * measure[n : 2 * n]).sqrt()
-                bias = c.relative * (_between(c.lesion_bias, fidelity) * shared).sum()
-        noisy, error = image[: 2 * n], error[: 2 * n]
+        _, towards, smoothed = views
+        of_view = ((towards if smoothed is None else smoothed) - truth).square()
+        measure = (of_view * counts).mean(dim=(1, 2, 3)).clamp_min(_LEAST_ERROR)
+        image = c.image * (error.square() * counts).mean(dim=(1, 2, 3)) / measure
+        total = 0.5 * image[: 2 * n].sum()
+        parts = {"image": total / c.image}
+        if c.lesion_bias != (0.0, 0.0) and progress >= c.flat_from:
+            there = counts[:n] * batch.lesions
+            both = (error[:n] * error[n : 2 * n] * there).mean(dim=(1, 2, 3))
+            bias = both / (measure[:n] * measure[n : 2 * n]).sqrt()
+            total = total + c.image * (_between(c.lesion_bias, fidelity) * bias).sum()
+            parts["lesion_bias"] = bias.sum()
+        error = error[: 2 * n]
         # The noise of an ROI mean falls with its size, but less than as 1/√voxels: neighbours are
         # correlated.
         size = (20.0 / batch.voxels.clamp_min(4.0)).pow(0.25) * c.contrast_sd
         d = torch.einsum("dnzyx,nrzyx->dnr", error.unflatten(0, (2, n)), batch.contrast) / size
         variance, product = d.square().mean(0), d[0] * d[1]
-        total = 0.5 * noisy.sum() + bias
         tame = 1.0 / (1.0 + variance.detach() / _TAME_CONTRAST)
-        kappa = _between(c.bias, fidelity)[:, None]
+        kappa = _between(c.contrast_bias, fidelity)[:, None]
         weight = c.contrast * (c.viewing + (1.0 - c.viewing) * fidelity)[:, None]
         total = total + (weight * tame * (variance + kappa * product)).sum()
-        parts = {
-            **({} if data is None else {"data": data[: 2 * n].sum() / 2}),
-            "white": white[: 2 * n].sum() / 2,
-            "contrast": variance.sum(),
-            "bias": product.sum(),
-        }
-        if free.numel():
-            total = total + c.noise_free / _NOISE_FREE_SHARE * image[2 * n :].sum()
+        parts |= {"contrast": variance.sum(), "contrast_bias": product.sum()}
         if c.noise_free:
-            parts["noise_free"] = image[2 * n :].sum() / (c.data + c.relative)
+            of_free = image[2 * n :].sum()
+            total = total + c.noise_free / _NOISE_FREE_SHARE * of_free
+            parts["noise_free"] = of_free / c.image
         # All at once: on a GPU each number that is asked for waits for all that was asked before.
         values = torch.stack([v.detach() for v in parts.values()]).tolist()
         return Loss(total, dict(zip(parts, values, strict=True)))

@@ -56,20 +56,20 @@ def test_the_truth_has_no_loss(data):
     assert float(loss.total) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_terms_by_their_definitions(data):
-    """A constant error c everywhere: no contrast error, c² (1 + edge in bodies), c² times the
-    mean of H 1."""
+def test_edges_and_bodies_count_more(data):
+    """A constant error c everywhere: no contrast error, and c² (1 + edge and body there) over the
+    same of the filtered view, whose error is not constant."""
     batch = data.batch(0, 4, range(2))
-    noisy = batch.problem.part(range(4))
-    error = 0.3 * torch.ones_like(noisy.b)
-    parts = Objective(ObjectiveConfig(edge=0.0))(Given(truth_of(batch) + error), batch).parts
-    assert parts["white"] == pytest.approx(2 * 0.09, rel=1e-4)
-    assert parts["data"] == pytest.approx(
-        float((error * noisy.apply(error)).mean((1, 2, 3)).sum()) / 2, rel=1e-4
-    )
-    assert parts["contrast"] == pytest.approx(0.0, abs=1e-4)
-    more = Objective(ObjectiveConfig(edge=2.0))(Given(truth_of(batch) + error), batch).parts
-    assert parts["white"] < more["white"] < 3 * parts["white"]
+    truth, (_, _, smoothed) = truth_of(batch), batch.views
+    assert smoothed is not None
+    of_view = (smoothed[:4] - truth).square()
+    for edge, body in ((0.0, 0.0), (2.0, 0.0), (2.0, 3.0)):
+        config = ObjectiveConfig(edge=edge, body=body)
+        parts = Objective(config)(Given(truth + 0.3), batch).parts
+        counts = (1.0 + edge * batch.edges + body * batch.bodies).repeat(2, 1, 1, 1)
+        ratio = 0.09 * counts.mean((1, 2, 3)) / (of_view * counts).mean((1, 2, 3))
+        assert parts["image"] == pytest.approx(float(ratio.sum()) / 2, rel=1e-4)
+        assert parts["contrast"] == pytest.approx(0.0, abs=1e-4)
 
 
 def test_scenes_count_alike_by_their_relative_error(data):
@@ -78,10 +78,9 @@ def test_scenes_count_alike_by_their_relative_error(data):
     truth, (_, _, smoothed) = truth_of(batch), batch.views
     assert smoothed is not None
     error = 2.0 * (smoothed[:4] - truth)
-    config = ObjectiveConfig(data=0.0, relative=3.0, contrast=0.0, edge=2.0, body=1.0, flat=1.0)
+    config = ObjectiveConfig(image=3.0, contrast=0.0, edge=2.0, body=1.0, flat=1.0)
     loss = Objective(config)(Given(truth + error), batch)
     assert float(loss.total) == pytest.approx(2 * 3.0 * 4.0, rel=1e-4)
-    assert "data" not in loss.parts
 
 
 def test_bias_of_lesions_is_what_both_draws_share(data):
@@ -93,7 +92,7 @@ def test_bias_of_lesions_is_what_both_draws_share(data):
     truth, (_, _, smoothed) = truth_of(batch), batch.views
     assert smoothed is not None
     error = 0.5 * (smoothed[:2] - truth[:2])
-    options = {"data": 0.0, "relative": 3.0, "contrast": 0.0, "edge": 0.0, "flat_from": 0.5}
+    options = {"image": 3.0, "contrast": 0.0, "edge": 0.0, "flat_from": 0.5}
 
     def total(sign, fidelity, bias, progress=1.0, error=error):
         both = torch.cat([error, sign * error])
@@ -118,7 +117,7 @@ def test_bias_of_lesions_is_what_both_draws_share(data):
 def test_without_a_filtered_view_the_step_towards_the_data_is_the_measure(data):
     batch = data.batch(0, 4, range(2))
     truth, (first, towards, _) = truth_of(batch), batch.views
-    config = ObjectiveConfig(data=0.0, relative=3.0, contrast=0.0)
+    config = ObjectiveConfig(image=3.0, contrast=0.0)
     bare = replace(batch, views=(first, towards, None))
     loss = Objective(config)(Given(towards[:4].clone()), bare)
     assert float(loss.total) == pytest.approx(2 * 3.0, rel=1e-4)
@@ -135,7 +134,7 @@ def test_noise_costs_once_and_bias_with_its_weight(data):
         error = 0.01 * torch.cat([s * push for s in signs])
         parts = Objective()(Given(truth_of(batch) + error), batch).parts
         assert parts["contrast"] > 0
-        assert parts["bias"] == pytest.approx(expected * parts["contrast"], rel=1e-3)
+        assert parts["contrast_bias"] == pytest.approx(expected * parts["contrast"], rel=1e-3)
 
 
 def test_steps_follow_the_training(data):
@@ -155,13 +154,15 @@ def test_bias_weighs_more_where_one_measures(data):
     given = Given(truth_of(batch) + 0.01 * torch.cat([push, push]))
     totals = [
         float(
-            Objective(ObjectiveConfig(bias=(0.0, 4.0), fidelities=(fidelity, fidelity)))(
+            Objective(ObjectiveConfig(contrast_bias=(0.0, 4.0), fidelities=(fidelity, fidelity)))(
                 given, batch
             ).total
         )
         for fidelity in (0, 1)
     ]
-    even = float(Objective(ObjectiveConfig(bias=(0.0, 0.0), fidelities=(1, 1)))(given, batch).total)
+    even = float(
+        Objective(ObjectiveConfig(contrast_bias=(0.0, 0.0), fidelities=(1, 1)))(given, batch).total
+    )
     assert totals[0] == pytest.approx(even)
     assert totals[1] > totals[0]
 
@@ -186,11 +187,16 @@ def test_the_scene_without_noise_counts_with_its_weight(data):
         total = Objective(ObjectiveConfig(contrast=0.0, noise_free=0.5))(model, drawn).total
         added[tuple(free)] = float(total) - float(without.total)
         assert model.sizes[-1] == 4 + len(free)
-    # Two draws and the scene have the same error: with a weight of a half and half of the scenes,
-    # once more.
+    # With a weight of a half and half of the scenes each counts once, over the error of its own
+    # filtered view.
     assert added[()] == pytest.approx(0.0, abs=1e-4)
-    assert added[0, 1] == pytest.approx(float(without.total), rel=1e-4)
-    assert added[0,] + added[1,] == pytest.approx(added[0, 1], rel=1e-4)
+    config = ObjectiveConfig(contrast=0.0)
+    truth = batch.truth / batch.problem.unit_hu[:2].reshape(-1, 1, 1, 1)
+    counts = 1.0 + config.edge * batch.edges + config.body * batch.bodies
+    of_view = ((batch.views[2][4:] - truth).square() * counts).mean((1, 2, 3))
+    each = config.image * 0.09 * counts.mean((1, 2, 3)) / of_view
+    assert [added[0,], added[1,]] == pytest.approx(each.tolist(), rel=1e-3)
+    assert added[0, 1] == pytest.approx(float(each.sum()), rel=1e-3)
     lots = torch.cat([data.batch(step, 4, range(4)).lots for step in range(10)])
     assert 0.25 < float((lots[:, 1] < 0.5).float().mean()) < 0.75
 

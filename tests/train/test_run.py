@@ -200,10 +200,10 @@ def test_damaged_checkpoint_falls_back_to_the_previous_one(tmp_path, uninterrupt
 
 def test_resume_refuses_another_configuration_or_model(tmp_path, caplog):
     run(tmp_path / "x", objective=StubObjective({1: send(signal.SIGTERM)}))
-    with pytest.raises(ValueError, match=r"learning_rate, objective\.white"):
+    with pytest.raises(ValueError, match=r"learning_rate, objective\.edge"):
         run(
             tmp_path / "x",
-            stub_config(learning_rate=1.0, objective=ObjectiveConfig(white=0.1)),
+            stub_config(learning_rate=1.0, objective=ObjectiveConfig(edge=0.1)),
             resume=True,
         )
     with pytest.raises(TensorFileError, match="another model"):
@@ -291,7 +291,7 @@ def test_what_comes_at_the_end_may_change_until_it_begins(tmp_path):
     other = {"begins": 0.75, "scenes": {"core_probability": 0.5}}
     with pytest.raises(ValueError, match=r"late\.scenes\.core_probability"):
         run(tmp_path / "x", stub_config(late=other), resume=True)
-    plain = ObjectiveConfig(relative=1.0, flat=1.0, flat_from=0.75)
+    plain = ObjectiveConfig(flat=1.0, flat_from=0.75)
     flat = [
         stub_config(steps=n, decay=0.0, unroll=1, objective=replace(plain, flat_from=f))
         for n, f in ((STEPS, 0.75), (2 * STEPS, 0.75), (STEPS, 0.9))
