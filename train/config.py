@@ -48,7 +48,12 @@ _MERGED = ("data", "late", "objective")
 """Sections that a file with a ``base`` gives in part."""
 OPTIMISERS = ("adam", "soap")
 """Names of the optimisers."""
-_FORMER_NAMES = {"looks": "fidelities", "relative": "image", "bias": "contrast_bias"}
+_FORMER_NAMES = {
+    "looks": "fidelities",
+    "relative": "image",
+    "bias": "contrast_bias",
+    "flat_from": "end_from",
+}
 """Of parts of the loss, which older files have, and what they are called now."""
 VALIDATED_AT_ONCE = 4
 """Scenes that a validation reconstructs at a time."""
@@ -253,15 +258,16 @@ class ObjectiveConfig:
     Args:
         image: of ‖e‖² over that of the filtered view; edge: by how much more a voxel counts in both
             within two voxels of an edge; body: in bodies and one voxel about them; flat: in bodies,
-            where the truth is constant for two voxels around, such as deep in a lumen; flat_from:
-            share of the training after which ``flat`` and ``lesion_bias`` count.
+            where the truth is constant for two voxels around, such as deep in a lumen.
         lesion_bias: by how much more than the variance the squared bias of each voxel of a lesion
             counts in ``image``, at fidelity 0 and at fidelity 1, linear between.
         noise_free: of ``image`` of the same scene without noise, against those with noise: what is
             left there is blur and overshoot.
         contrast: of the ROI contrasts' errors at fidelity 1; viewing: share of it that is left at
-            fidelity 0, linear between.
+            fidelity 0, linear between; contrast_end: ``contrast`` in the end, None if it stays.
         contrast_bias: κ at fidelity 0 and at fidelity 1, linear between.
+        end_from: share of the training after which the end begins: ``flat``, ``lesion_bias`` and
+            ``contrast_end`` count.
         contrast_sd: an ROI contrast error, in noise units, that counts as 1.
         fidelities: range of the fidelity, uniform.
         held_out: scenes of the validation, of another seed than those of the training.
@@ -274,12 +280,13 @@ class ObjectiveConfig:
     edge: float = 2.0
     body: float = 0.0
     flat: float = 0.0
-    flat_from: float = 0.0
     lesion_bias: tuple[float, float] = (0.0, 0.0)
     noise_free: float = 0.0
     contrast: float = 0.2
+    contrast_end: float | None = None
     viewing: float = 1.0
     contrast_bias: tuple[float, float] = (1.0, 1.0)
+    end_from: float = 0.0
     contrast_sd: float = 0.15
     fidelities: tuple[float, float] = (0.0, 1.0)
     held_out: int = 64
@@ -288,7 +295,9 @@ class ObjectiveConfig:
         for name in ("edge", "body", "flat", "noise_free", "contrast"):
             _set(self, **{name: number(name, getattr(self, name), low=0.0)})
         _set(self, image=number("image", self.image, positive=True))
-        _set(self, flat_from=number("flat_from", self.flat_from, low=0.0, high=1.0))
+        if self.contrast_end is not None:
+            _set(self, contrast_end=number("contrast_end", self.contrast_end, low=0.0))
+        _set(self, end_from=number("end_from", self.end_from, low=0.0, high=1.0))
         _set(self, viewing=number("viewing", self.viewing, low=0.0, high=1.0))
         _set(self, contrast_sd=number("contrast_sd", self.contrast_sd, positive=True))
         for name in ("contrast_bias", "lesion_bias"):
@@ -430,9 +439,9 @@ class TrainConfig:
     def loss_changes(self) -> int | None:
         """The first step with all parts of the loss; None if all steps have them."""
         o = self.objective
-        later = bool(o.flat) or o.lesion_bias != (0.0, 0.0)
-        first = math.floor(self.steps * o.flat_from)
-        first += first / self.steps < o.flat_from  # as the loss compares its progress
+        later = bool(o.flat) or o.lesion_bias != (0.0, 0.0) or o.contrast_end is not None
+        first = math.floor(self.steps * o.end_from)
+        first += first / self.steps < o.end_from  # as the loss compares its progress
         return first if later else None
 
     @property

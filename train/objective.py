@@ -132,7 +132,8 @@ class Objective:
         truth = batch.truth[scene] / problem.unit_hu.reshape(-1, 1, 1, 1)
         error = made - truth
         places = c.edge * batch.edges + c.body * batch.bodies
-        if c.flat and progress >= c.flat_from:
+        end = progress >= c.end_from
+        if c.flat and end:
             places = places + c.flat * batch.bodies * (spread(batch.truth) < _FLAT_HU)
         counts = 1.0 + places[scene]
         _, towards, smoothed = views
@@ -141,7 +142,7 @@ class Objective:
         image = c.image * (error.square() * counts).mean(dim=(1, 2, 3)) / measure
         total = 0.5 * image[: 2 * n].sum()
         parts = {"image": total / c.image}
-        if c.lesion_bias != (0.0, 0.0) and progress >= c.flat_from:
+        if c.lesion_bias != (0.0, 0.0) and end:
             there = counts[:n] * batch.lesions
             both = (error[:n] * error[n : 2 * n] * there).mean(dim=(1, 2, 3))
             bias = both / (measure[:n] * measure[n : 2 * n]).sqrt()
@@ -155,7 +156,8 @@ class Objective:
         variance, product = d.square().mean(0), d[0] * d[1]
         tame = 1.0 / (1.0 + variance.detach() / _TAME_CONTRAST)
         kappa = _between(c.contrast_bias, fidelity)[:, None]
-        weight = c.contrast * (c.viewing + (1.0 - c.viewing) * fidelity)[:, None]
+        of_contrast = c.contrast_end if end and c.contrast_end is not None else c.contrast
+        weight = of_contrast * (c.viewing + (1.0 - c.viewing) * fidelity)[:, None]
         total = total + (weight * tame * (variance + kappa * product)).sum()
         parts |= {"contrast": variance.sum(), "contrast_bias": product.sum()}
         if c.noise_free:

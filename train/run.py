@@ -202,8 +202,9 @@ class Run:
                 "decay",
                 "final_fraction",
                 "objective.flat",
-                "objective.flat_from",
                 "objective.lesion_bias",
+                "objective.contrast_end",
+                "objective.end_from",
             }
         if reached <= min(self.config.late_begins, before.late_begins):
             other = {name for name in other if not name.startswith("late.")}

@@ -92,7 +92,7 @@ def test_bias_of_lesions_is_what_both_draws_share(data):
     truth, (_, _, smoothed) = truth_of(batch), batch.views
     assert smoothed is not None
     error = 0.5 * (smoothed[:2] - truth[:2])
-    options = {"image": 3.0, "contrast": 0.0, "edge": 0.0, "flat_from": 0.5}
+    options = {"image": 3.0, "contrast": 0.0, "edge": 0.0, "end_from": 0.5}
 
     def total(sign, fidelity, bias, progress=1.0, error=error):
         both = torch.cat([error, sign * error])
@@ -165,6 +165,24 @@ def test_bias_weighs_more_where_one_measures(data):
     )
     assert totals[0] == pytest.approx(even)
     assert totals[1] > totals[0]
+
+
+def test_contrasts_may_weigh_more_in_the_end(data):
+    batch = with_contrast(data)
+    roi = batch.contrast[:, -1]
+    push = roi / roi.square().sum((1, 2, 3), keepdim=True).clamp_min(1e-6)
+    given = Given(truth_of(batch) + 0.01 * torch.cat([push, push]))
+
+    def total(progress, **options):
+        config = ObjectiveConfig(end_from=0.5, **options)
+        return float(Objective(config)(given, batch, progress).total)
+
+    plain, without = total(1.0, contrast=0.2), total(1.0, contrast=0.0)
+    assert plain > without
+    assert total(0.4, contrast=0.2, contrast_end=0.8) == pytest.approx(plain)
+    in_the_end = total(0.5, contrast=0.2, contrast_end=0.8)
+    assert in_the_end - without == pytest.approx(4.0 * (plain - without), rel=1e-3)
+    assert total(0.5, contrast=0.2, contrast_end=0.0) == pytest.approx(without)
 
 
 def test_the_scene_without_noise_counts_with_its_weight(data):

@@ -291,15 +291,16 @@ def test_what_comes_at_the_end_may_change_until_it_begins(tmp_path):
     other = {"begins": 0.75, "scenes": {"core_probability": 0.5}}
     with pytest.raises(ValueError, match=r"late\.scenes\.core_probability"):
         run(tmp_path / "x", stub_config(late=other), resume=True)
-    plain = ObjectiveConfig(flat=1.0, flat_from=0.75)
+    plain = ObjectiveConfig(flat=1.0, end_from=0.75)
     flat = [
-        stub_config(steps=n, decay=0.0, unroll=1, objective=replace(plain, flat_from=f))
+        stub_config(steps=n, decay=0.0, unroll=1, objective=replace(plain, end_from=f))
         for n, f in ((STEPS, 0.75), (2 * STEPS, 0.75), (STEPS, 0.9))
     ]
-    run(tmp_path / "y", flat[0], StubObjective({2: send(signal.SIGTERM)}))
+    run(tmp_path / "y", flat[0], StubObjective({1: send(signal.SIGTERM)}))
     heavier = replace(flat[0], objective=replace(plain, flat=2.0))
     biased = replace(flat[0], objective=replace(plain, lesion_bias=(0.0, 2.0)))
-    for step, changed in ((4, heavier), (6, biased)):
+    shown = replace(flat[0], objective=replace(plain, contrast_end=2.0))
+    for step, changed in ((3, heavier), (5, biased), (7, shown)):
         run(tmp_path / "y", changed, StubObjective({step: send(signal.SIGTERM)}), resume=True)
     run(tmp_path / "y", flat[2], StubObjective({10: send(signal.SIGTERM)}), resume=True)
     with pytest.raises(ValueError, match="steps"):
@@ -330,9 +331,9 @@ def test_weights_of_a_part_of_the_loss_do_not_ship(tmp_path):
         def validate(self, model, held_out):
             return replace(super().validate(model, held_out), score=-float(self.validations))
 
-    for flat_from, step in ((0.5, 10), (5 / STEPS, 10), (0.0, 5)):
-        config = stub_config(objective=ObjectiveConfig(flat=1.0, flat_from=flat_from))
-        out = tmp_path / str(flat_from)
+    for end_from, step in ((0.5, 10), (5 / STEPS, 10), (0.0, 5)):
+        config = stub_config(objective=ObjectiveConfig(flat=1.0, end_from=end_from))
+        out = tmp_path / str(end_from)
         run(out, config, Falling())
         assert json.loads((out / "card.json").read_text())["step"] == step
 
