@@ -22,6 +22,9 @@ reference's ROI means. Of FBP all but noise and d′ is exact.
   error should have no sign. Of two halves of the realisations one names the hundredth of the voxels
   with the largest mean errors, the other tells its own mean error there, in their direction; so
   what is noise adds nothing on average;
+* false body: the largest contrast, of either sign, that a ball of 1 mm has with what is around it,
+  anywhere in the inset where no blur of an edge reaches; a mean over realisations. Of noise, too:
+  the larger it is beside what is shown of a true body, the less can a body be believed;
 * false contour: the mean error's largest fall over 0.4 mm with the distance from the bodies, where
   no border is;
 * limit: the variance of the best unbiased estimate if all outlines were known, the same ratio.
@@ -335,6 +338,8 @@ def records_of(
     add("error", "beside the signal", own.rmse(readings.square_beside), "HU")
     if readings.invented.shape[1] >= _ENOUGH:
         add("invented contrast", "about the bodies", own.invented(), "HU")
+    if np.isfinite(readings.false_body).all():
+        add("false body", "where nothing is", _mean(readings.false_body), "HU")
     if readings.shells.shape[1] >= 3:
         add("false contour", "about the bodies", own.contour(), "HU")
     add("error without noise", "near the bodies", math.sqrt(readings.clean_square), "HU")

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, signal
 from torch import Tensor
 
 from recon.evaluate.methods import Method, Realisation
@@ -55,6 +55,10 @@ _SMOOTHED_MM = 0.3
 for in them, mm."""
 _SOME_VOXELS = 4000
 """Voxels in which it is looked for."""
+_BALL_MM = 1.0
+"""Diameter of the false bodies that are looked for, mm."""
+_AROUND_MM = (0.7, 1.2)
+"""Distances from their centres that what is around them has, mm."""
 _BORDER_HU = 50.0
 """A border that a reader would take for a wall, HU."""
 _FEWEST = 50
@@ -72,6 +76,8 @@ class RoiReadings:
         square: ``(n,)`` mean square error with the signal near the bodies, HU².
         square_beside: ``(n,)`` the same beside the signal.
         invented: ``(n, voxels)`` smoothed error with the signal where nothing is, HU.
+        false_body: ``(n,)`` largest contrast with the signal, of either sign, of a ball of 1 mm
+            where nothing is, HU; NaN: none fits there.
         shells: ``(n, shells)`` mean error with the signal around the bodies, from near to far, HU.
         flat: tissue → ``(n, voxels)`` HU, with the signal.
         clean_rois: ``(2, rois, 2)`` of noise-free data; clean_square: likewise; clean_rim: least
@@ -90,6 +96,7 @@ class RoiReadings:
     square: Floats
     square_beside: Floats
     invented: NDArray[np.float32]
+    false_body: Floats
     shells: Floats
     flat: dict[str, NDArray[np.float32]]
     clean_rois: Floats
@@ -177,6 +184,29 @@ class Reader:
         at = at[:: -(-len(at) // _SOME_VOXELS)] if len(at) else at
         weights = ndimage.gaussian_filter(mask, [_SMOOTHED_MM / s for s in self.task.grid.spacing])
         return at, weights.reshape(-1)[at]
+
+    def false_body(self, volume: Tensor) -> float:
+        """Largest contrast, of either sign, of a ball with what is around it, anywhere where
+        nothing is, HU; NaN: no ball fits there."""
+        (ball, around), weight, fits = self._balls
+        if not fits.any():
+            return math.nan
+        error = (volume - self.truth[0]).double().numpy() * self.task.empty.numpy()
+        inside, outside = (signal.oaconvolve(error, k, "same")[fits] for k in (ball, around))
+        return float(np.abs(inside - outside / weight[fits]).max())
+
+    @cached_property
+    def _balls(self) -> tuple[tuple[Floats, Floats], Floats, NDArray[np.bool_]]:
+        """A ball and what is around it, as kernels of sum 1; the share of the latter where nothing
+        is, and where the ball and half of what is around it fit in."""
+        reach = [math.ceil(_AROUND_MM[1] / s) for s in self.task.grid.spacing]
+        at = np.stack(np.meshgrid(*(np.arange(-r, r + 1) for r in reach), indexing="ij"), axis=-1)
+        away = np.linalg.norm(at * self.task.grid.spacing, axis=-1)
+        masks = away <= _BALL_MM / 2, (away >= _AROUND_MM[0]) & (away <= _AROUND_MM[1])
+        ball, around = (mask / mask.sum() for mask in masks)
+        empty = self.task.empty.double().numpy()
+        inside, weight = (signal.oaconvolve(empty, k, "same") for k in (ball, around))
+        return (ball, around), weight, (inside > 1.0 - 1e-6) & (weight > 0.5)
 
     def shells(self, volume: Tensor) -> list[float]:
         """Mean error around the bodies, away from borders that are there."""
@@ -276,7 +306,7 @@ def kept_as(method: Method, exposure_s: float, task: Task, seed: int) -> tuple[s
     name = "".join(c if c.isalnum() or c in "-_." else "_" for c in method.name)
     if name.startswith(".") or len(name.encode()) > _LONGEST:
         name = f"{name.strip('.')[:40]}-{hashlib.sha256(method.name.encode()).hexdigest()[:12]}"
-    return f"{name}/{exposure_s:g}s", f"7 {method.name} {method.key} {seed} {task.fingerprint}"
+    return f"{name}/{exposure_s:g}s", f"8 {method.name} {method.key} {seed} {task.fingerprint}"
 
 
 class Measurement:
@@ -339,6 +369,7 @@ class Measurement:
             square=joined["square"],
             square_beside=joined["square_beside"],
             invented=joined["invented"],
+            false_body=joined["false_body"],
             shells=joined["shells"],
             flat={t: joined[f"flat_{t}"] for t in self.reader.task.flat},
             clean_rois=clean["rois"][0],
@@ -372,6 +403,7 @@ def _measure_pairs(
             "square",
             "square_beside",
             "invented",
+            "false_body",
             "shells",
             "rim",
         )
@@ -399,6 +431,7 @@ def _measure_pairs(
         lists["square"].append(reader.square(volumes[0], reader.task.near))
         lists["square_beside"].append(reader.square(volumes[0], reader.task.beside))
         lists["invented"].append(reader.invented(volumes[0]))
+        lists["false_body"].append(reader.false_body(volumes[0]))
         lists["shells"].append(reader.shells(volumes[0]))
         lists["rim"].append(reader.rim(volumes[0]))
         for t, values in reader.flat(volumes[0]).items():

@@ -443,18 +443,20 @@ class Task:
         )
 
     @cached_property
-    def quiet(self) -> Tensor:
-        """Mask ``grid.shape`` of tissue about the bodies, so far from all edges that their blur
-        does not reach there: whatever contrast a volume shows within it is invented."""
+    def empty(self) -> Tensor:
+        """Mask ``grid.shape`` of tissue so far from all edges that their blur does not reach there:
+        whatever contrast a volume shows within it is invented."""
         tissue = np.argmax(self._constant, axis=0)
         mixed = np.max(self._constant, axis=0) < 1.0 - 1e-6
         edges = mixed | (ndimage.maximum_filter(tissue, 3) != ndimage.minimum_filter(tissue, 3))
         away = ndimage.distance_transform_edt(~edges, sampling=self.grid.spacing)
-        about = (
-            ndimage.distance_transform_edt(self._rest > 0.5, sampling=self.grid.spacing)
-            <= _ABOUT_MM
-        )
-        return torch.from_numpy((away > BESIDE_MM) & about & self._inner)
+        return torch.from_numpy((away > BESIDE_MM) & self._inner)
+
+    @cached_property
+    def quiet(self) -> Tensor:
+        """Mask ``grid.shape`` of what of :attr:`empty` is about the bodies."""
+        away = ndimage.distance_transform_edt(self._rest > 0.5, sampling=self.grid.spacing)
+        return self.empty & torch.from_numpy(away <= _ABOUT_MM)
 
     @property
     def _constant(self) -> list[Floats]:

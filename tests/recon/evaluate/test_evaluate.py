@@ -231,9 +231,31 @@ def test_only_what_lies_away_from_edges_is_read_as_nothing(task, found):
     # shell.
     np.testing.assert_allclose(reader.invented(reader.truth[0] + 5.0), 5.0, rtol=1e-5)
     np.testing.assert_allclose(reader.shells(reader.truth[0] + 5.0), 5.0, rtol=1e-5)
+    assert reader.false_body(reader.truth[0] + 5.0) == pytest.approx(0.0, abs=1e-9)
     assert len(reader.shells(reader.truth[0])) >= 3
     square = value(found, "error", "fbp:soft", "beside the signal")["value"]
     assert abs(value(found, "invented contrast", "fbp:soft", "about the bodies")["value"]) < square
+
+
+def test_a_false_body_is_the_largest_ball_where_nothing_is(task, found):
+    (seen,) = found.results
+    reader = Reader(task, task.truth(seen.ground_truth))
+    empty = task.empty.numpy()
+    about = ndimage.uniform_filter(empty.astype(float), 7, mode="constant")
+    deep = about * ndimage.binary_erosion(empty)
+    at = np.array(np.unravel_index(deep.argmax(), empty.shape))
+    away = np.linalg.norm(
+        (np.moveaxis(np.indices(empty.shape), 0, -1) - at) * task.grid.spacing, axis=-1
+    )
+    ball = torch.from_numpy(away <= 0.5)
+    for hu in (80.0, -60.0):
+        assert reader.false_body(reader.truth[0] + hu * ball) == pytest.approx(abs(hu), rel=1e-3)
+    # At edges and in the bodies it is no false one.
+    there = torch.from_numpy(~empty)
+    assert reader.false_body(reader.truth[0] + 500.0 * there) == pytest.approx(0.0, abs=1e-9)
+    read = value(found, "false body", "fbp:soft", "where nothing is")
+    assert read["low"] < read["value"] < read["high"]
+    assert read["value"] > 5.0
 
 
 def test_the_report_names_who_shows_less_and_does_not_say_so(found):
