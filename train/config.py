@@ -258,7 +258,8 @@ class ObjectiveConfig:
     Args:
         image: of ‖e‖² over that of the filtered view; edge: by how much more a voxel counts in both
             within two voxels of an edge; body: in bodies and one voxel about them; flat: in bodies,
-            where the truth is constant for two voxels around, such as deep in a lumen.
+            where the truth is constant for two voxels around, such as deep in a lumen; empty: likewise
+            outside of bodies, such as in fat.
         lesion_bias: by how much more than the variance the squared bias of each voxel of a lesion
             counts in ``image``, at fidelity 0 and at fidelity 1, linear between.
         noise_free: of ``image`` of the same scene without noise, against those with noise: what is
@@ -266,8 +267,8 @@ class ObjectiveConfig:
         contrast: of the ROI contrasts' errors at fidelity 1; viewing: share of it that is left at
             fidelity 0, linear between; contrast_end: ``contrast`` in the end, None if it stays.
         contrast_bias: κ at fidelity 0 and at fidelity 1, linear between.
-        end_from: share of the training after which the end begins: ``flat``, ``lesion_bias`` and
-            ``contrast_end`` count.
+        end_from: share of the training after which the end begins: ``flat``, ``empty``,
+            ``lesion_bias`` and ``contrast_end`` count.
         contrast_sd: an ROI contrast error, in noise units, that counts as 1.
         fidelities: range of the fidelity, uniform.
         held_out: scenes of the validation, of another seed than those of the training.
@@ -280,6 +281,7 @@ class ObjectiveConfig:
     edge: float = 2.0
     body: float = 0.0
     flat: float = 0.0
+    empty: float = 0.0
     lesion_bias: tuple[float, float] = (0.0, 0.0)
     noise_free: float = 0.0
     contrast: float = 0.2
@@ -292,7 +294,7 @@ class ObjectiveConfig:
     held_out: int = 64
 
     def __post_init__(self) -> None:
-        for name in ("edge", "body", "flat", "noise_free", "contrast"):
+        for name in ("edge", "body", "flat", "empty", "noise_free", "contrast"):
             _set(self, **{name: number(name, getattr(self, name), low=0.0)})
         _set(self, image=number("image", self.image, positive=True))
         if self.contrast_end is not None:
@@ -439,7 +441,7 @@ class TrainConfig:
     def loss_changes(self) -> int | None:
         """The first step with all parts of the loss; None if all steps have them."""
         o = self.objective
-        later = bool(o.flat) or o.lesion_bias != (0.0, 0.0) or o.contrast_end is not None
+        later = bool(o.flat or o.empty) or o.lesion_bias != (0.0, 0.0) or o.contrast_end is not None
         first = math.floor(self.steps * o.end_from)
         first += first / self.steps < o.end_from  # as the loss compares its progress
         return first if later else None

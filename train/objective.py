@@ -7,8 +7,8 @@ with errors e₁, e₂ in noise units:
 * ``image``: ‖e‖² over that of the filtered view of the same data, so that scenes count alike: their
   squared errors differ by far more than one power of ten, and the largest would decide a step
   (``train/experiments.md``); more on both sides of edges, where blur and undershoot are, and in
-  bodies, which are small beside what surrounds them; more again deep in wide bodies, where no
-  contrast can be lost and noise alone is left;
+  bodies, which are small beside what surrounds them; more again where tissue is constant, deep in
+  wide bodies and outside of them: no contrast can be lost there, and noise that is shown is false;
 * ``lesion_bias``: e₁ᵀe₂ per voxel where the scene holds a lesion, over the same. As the draws are
   independent, its mean is the squared bias, so κ trades variance against bias there: small and
   faint bodies, which are nothing beside the error of edges, are shown instead of smoothed away. In
@@ -133,8 +133,9 @@ class Objective:
         error = made - truth
         places = c.edge * batch.edges + c.body * batch.bodies
         end = progress >= c.end_from
-        if c.flat and end:
-            places = places + c.flat * batch.bodies * (spread(batch.truth) < _FLAT_HU)
+        if (c.flat or c.empty) and end:
+            constant = spread(batch.truth) < _FLAT_HU
+            places = places + constant * (c.flat * batch.bodies + c.empty * (1.0 - batch.bodies))
         counts = 1.0 + places[scene]
         _, towards, smoothed = views
         of_view = ((towards if smoothed is None else smoothed) - truth).square()

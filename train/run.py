@@ -202,6 +202,7 @@ class Run:
                 "decay",
                 "final_fraction",
                 "objective.flat",
+                "objective.empty",
                 "objective.lesion_bias",
                 "objective.contrast_end",
                 "objective.end_from",

@@ -10,7 +10,7 @@ from torch import nn
 from recon.mbir.network import NetworkConfig
 from recon.mbir.unrolled import Unrolled
 from train.config import DataConfig, ObjectiveConfig, Situation
-from train.data import Data, _edges
+from train.data import Data, _edges, spread
 from train.objective import Objective
 
 CONFIG = DataConfig(
@@ -70,6 +70,24 @@ def test_edges_and_bodies_count_more(data):
         ratio = 0.09 * counts.mean((1, 2, 3)) / (of_view * counts).mean((1, 2, 3))
         assert parts["image"] == pytest.approx(float(ratio.sum()) / 2, rel=1e-4)
         assert parts["contrast"] == pytest.approx(0.0, abs=1e-4)
+
+
+def test_constant_tissue_counts_more_in_the_end(data):
+    """By ``flat`` in bodies, by ``empty`` elsewhere."""
+    batch = data.batch(0, 4, range(2))
+    truth, (_, _, smoothed) = truth_of(batch), batch.views
+    assert smoothed is not None
+    of_view = (smoothed[:4] - truth).square()
+    constant = spread(batch.truth) < 10.0
+    places = {"flat": constant * (batch.bodies > 0), "empty": constant * (batch.bodies == 0)}
+    assert all(bool(place.any()) for place in places.values())
+    for name, place in places.items():
+        config = ObjectiveConfig(edge=0.0, end_from=0.5, **{name: 7.0})
+        for progress, weight in ((0.4, 0.0), (0.5, 7.0)):
+            parts = Objective(config)(Given(truth + 0.3), batch, progress).parts
+            counts = (1.0 + weight * place).repeat(2, 1, 1, 1)
+            ratio = 0.09 * counts.mean((1, 2, 3)) / (of_view * counts).mean((1, 2, 3))
+            assert parts["image"] == pytest.approx(float(ratio.sum()) / 2, rel=1e-4)
 
 
 def test_scenes_count_alike_by_their_relative_error(data):

@@ -299,7 +299,7 @@ def test_what_comes_at_the_end_may_change_until_it_begins(tmp_path):
     run(tmp_path / "y", flat[0], StubObjective({1: send(signal.SIGTERM)}))
     heavier = replace(flat[0], objective=replace(plain, flat=2.0))
     biased = replace(flat[0], objective=replace(plain, lesion_bias=(0.0, 2.0)))
-    shown = replace(flat[0], objective=replace(plain, contrast_end=2.0))
+    shown = replace(flat[0], objective=replace(plain, contrast_end=2.0, empty=1.0))
     for step, changed in ((3, heavier), (5, biased), (7, shown)):
         run(tmp_path / "y", changed, StubObjective({step: send(signal.SIGTERM)}), resume=True)
     run(tmp_path / "y", flat[2], StubObjective({10: send(signal.SIGTERM)}), resume=True)
