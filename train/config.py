@@ -258,8 +258,8 @@ class ObjectiveConfig:
     Args:
         image: of ‖e‖² over that of the filtered view; edge: by how much more a voxel counts in both
             within two voxels of an edge; body: in bodies and one voxel about them; flat: in bodies,
-            where the truth is constant for two voxels around, such as deep in a lumen; empty: likewise
-            outside of bodies, such as in fat.
+            where the truth is constant for two voxels around, such as deep in a lumen; empty: the
+            same outside of bodies, such as in fat.
         lesion_bias: by how much more than the variance the squared bias of each voxel of a lesion
             counts in ``image``, at fidelity 0 and at fidelity 1, linear between.
         noise_free: of ``image`` of the same scene without noise, against those with noise: what is

@@ -75,6 +75,9 @@ def test_edges_and_bodies_count_more(data):
 def test_constant_tissue_counts_more_in_the_end(data):
     """By ``flat`` in bodies, by ``empty`` elsewhere."""
     batch = data.batch(0, 4, range(2))
+    half = torch.zeros_like(batch.truth)
+    half[..., : half.shape[-1] // 2] = 1.0
+    batch = replace(batch, truth=100.0 * half, bodies=half)
     truth, (_, _, smoothed) = truth_of(batch), batch.views
     assert smoothed is not None
     of_view = (smoothed[:4] - truth).square()
