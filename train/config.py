@@ -55,6 +55,8 @@ _FORMER_NAMES = {
     "flat_from": "end_from",
 }
 """Of parts of the loss, which older files have, and what they are called now."""
+OF_THE_END = ("flat", "empty", "lesion_bias", "contrast_end")
+"""Parts of the loss that count from ``end_from`` on."""
 VALIDATED_AT_ONCE = 4
 """Scenes that a validation reconstructs at a time."""
 
@@ -267,8 +269,8 @@ class ObjectiveConfig:
         contrast: of the ROI contrasts' errors at fidelity 1; viewing: share of it that is left at
             fidelity 0, linear between; contrast_end: ``contrast`` in the end, None if it stays.
         contrast_bias: κ at fidelity 0 and at fidelity 1, linear between.
-        end_from: share of the training after which the end begins: ``flat``, ``empty``,
-            ``lesion_bias`` and ``contrast_end`` count.
+        end_from: share of the training after which the end begins: what :data:`OF_THE_END` names
+            counts from there on.
         contrast_sd: an ROI contrast error, in noise units, that counts as 1.
         fidelities: range of the fidelity, uniform.
         held_out: scenes of the validation, of another seed than those of the training.
@@ -441,7 +443,7 @@ class TrainConfig:
     def loss_changes(self) -> int | None:
         """The first step with all parts of the loss; None if all steps have them."""
         o = self.objective
-        later = bool(o.flat or o.empty) or o.lesion_bias != (0.0, 0.0) or o.contrast_end is not None
+        later = any(getattr(o, name) != getattr(ObjectiveConfig, name) for name in OF_THE_END)
         first = math.floor(self.steps * o.end_from)
         first += first / self.steps < o.end_from  # as the loss compares its progress
         return first if later else None

@@ -31,7 +31,7 @@ from recon.mbir.weights_io import TensorFileError, digest, write_tensors
 from recon.study.study import environment
 from torchpcct.files import atomic_write
 from train.checkpoint import CheckpointStore
-from train.config import TrainConfig, differences
+from train.config import OF_THE_END, TrainConfig, differences
 from train.data import Data, seed_of
 from train.logs import Logs
 from train.objective import Objective
@@ -201,11 +201,8 @@ class Run:
                 "steps",
                 "decay",
                 "final_fraction",
-                "objective.flat",
-                "objective.empty",
-                "objective.lesion_bias",
-                "objective.contrast_end",
                 "objective.end_from",
+                *(f"objective.{name}" for name in OF_THE_END),
             }
         if reached <= min(self.config.late_begins, before.late_begins):
             other = {name for name in other if not name.startswith("late.")}

@@ -199,9 +199,7 @@ class Reader:
     def _balls(self) -> tuple[tuple[Floats, Floats], Floats, NDArray[np.bool_]]:
         """A ball and what is around it, as kernels of sum 1; the share of the latter where nothing
         is, and where the ball and half of what is around it fit in."""
-        reach = [math.ceil(_AROUND_MM[1] / s) for s in self.task.grid.spacing]
-        at = np.stack(np.meshgrid(*(np.arange(-r, r + 1) for r in reach), indexing="ij"), axis=-1)
-        away = np.linalg.norm(at * self.task.grid.spacing, axis=-1)
+        away = _distances(_AROUND_MM[1], self.task.grid.spacing)
         masks = away <= _BALL_MM / 2, (away >= _AROUND_MM[0]) & (away <= _AROUND_MM[1])
         ball, around = (mask / mask.sum() for mask in masks)
         empty = self.task.empty.double().numpy()
@@ -215,9 +213,7 @@ class Reader:
 
     @cached_property
     def _shells(self) -> list[Tensor]:
-        reach = [math.ceil(BESIDE_MM / s) for s in self.task.grid.spacing]
-        at = np.stack(np.meshgrid(*(np.arange(-r, r + 1) for r in reach), indexing="ij"), axis=-1)
-        ball = np.linalg.norm(at * self.task.grid.spacing, axis=-1) <= BESIDE_MM
+        ball = _distances(BESIDE_MM, self.task.grid.spacing) <= BESIDE_MM
         borders = np.zeros(self.task.grid.shape, bool)
         for truth in self.truth:
             hu = truth.numpy()
@@ -237,6 +233,13 @@ class Reader:
     def flat(self, volume: Tensor) -> dict[str, Floats32]:
         """Voxels of every flat tissue."""
         return {t: volume.reshape(-1)[at].float().numpy() for t, at in self.task.flat.items()}
+
+
+def _distances(reach_mm: float, spacing: Sequence[float]) -> Floats:
+    """From the middle of a box of voxels that holds a ball of this radius, mm."""
+    reach = [math.ceil(reach_mm / s) for s in spacing]
+    at = np.stack(np.meshgrid(*(np.arange(-r, r + 1) for r in reach), indexing="ij"), axis=-1)
+    return np.asarray(np.linalg.norm(at * spacing, axis=-1))
 
 
 def volume_of(method: Method, realisation: Realisation) -> Tensor:
