@@ -103,7 +103,9 @@ class Inset:
             f"a body of about {body['diameter_mm']:.1f} mm should be "
             f"{'brighter' if body['contrast_hu'] > 0 else 'darker'} "
             f"({body['deviations']:.1f} standard deviations of noise); the prior has lost it, or "
-            'part of it: look there in "fbp" or "pwls"'
+            "part of it, or exaggerates what is "
+            f"{'darker' if body['contrast_hu'] > 0 else 'brighter'} there: "
+            'look there in "fbp" or "pwls"'
         ]
 
     def _onto_grid(self, hu: Tensor) -> Tensor:
