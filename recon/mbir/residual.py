@@ -62,9 +62,10 @@ beyond, the data decide themselves."""
 _STANDS_OUT = 7.0
 """Standard deviations of noise from which a ball is missing: noise alone has five in one of a
 hundred insets, edges of sound vessels have 5.4 at 2 s."""
-_LEAST_NOISE_HU = 40.0
-"""Standard deviation of the smallest ball's contrast below which no ball is asked for: what sharp
-edges leave in the data of voxels, up to 200 HU at the end of a lumen, stands out of less noise."""
+_LEAST_NOISE_HU = 36.5
+"""Standard deviation of the smallest ball's contrast, estimated from the data alone, below which no
+ball is asked for: what sharp edges leave in the data of voxels, up to 200 HU at the end of a lumen,
+stands out of less noise."""
 _MOST_NOISE = 1.5
 """What is left of the data in most places is taken for noise up to so many times their noise:
 sound vessels have 1.34 at most. Beyond, it is what is missing."""
@@ -148,8 +149,11 @@ def missing_body(problem: Quadratic, left: Tensor, kept: Tensor) -> list[Missing
         unit = typical.clamp(deviation, _MOST_NOISE * deviation).clamp_min(
             torch.finfo(typical.dtype).tiny
         )
-        contrast = problem.unit_hu / (signal * (math.pi / 6.0) * voxels**3)
-        noise_hu = noise_hu or (deviation * contrast).tolist()
+        unit_contrast = problem.unit_hu / ((math.pi / 6.0) * voxels**3)
+        contrast = unit_contrast / signal
+        if not noise_hu:
+            in_data = (template * problem.apply(template)).sum(_AXES)
+            noise_hu = (unit_contrast * in_data.rsqrt()).tolist()
         for k, own in enumerate(score):
             at = int(own.abs().argmax())
             z, y, x = (int(n) + rim for n in torch.unravel_index(torch.tensor(at), own.shape))
