@@ -36,6 +36,8 @@ LONGEST_INTERVAL = 120.0
 """Largest ``checkpoint_seconds``: what a killed run may lose, in s."""
 _MOST = 10**9
 """Steps, scenes and views at most: more are a slip of the pen."""
+_MOST_MARGIN = 8
+"""Voxels: no core is deeper."""
 _HIGHEST = {"seed": 2**62, "unroll": 1000}
 """Other limits."""
 _MOST_VOXELS = 1024
@@ -55,6 +57,8 @@ _FORMER_NAMES = {
     "flat_from": "end_from",
 }
 """Of parts of the loss, which older files have, and what they are called now."""
+OF_ROIS = ("core_roi", "tissue_roi", "flat_roi", "roi_margin")
+"""Fields of :class:`DataConfig` that no view of a scene depends on."""
 OF_THE_END = ("flat", "empty", "lesion_bias", "contrast_end")
 """Parts of the loss that count from ``end_from`` on."""
 VALIDATED_AT_ONCE = 4
@@ -171,6 +175,9 @@ class DataConfig:
             of the usual shape.
         core_roi, tissue_roi: ranges of the radii of the random ROIs, mm.
         flat_roi: share of ROIs that are discs of one slice, as in an axial image, instead of balls.
+        roi_margin: voxels by which ROIs in cores keep away from the border, where at least 8 voxels
+            are left: there contrast is lost to blur, and to count it there teaches a network to
+            exaggerate it in the middle.
 
     Raises:
         TypeError, ValueError: a value is out of its range, or ``scenes`` or a situation has an
@@ -187,6 +194,7 @@ class DataConfig:
     core_roi: tuple[float, float] = (0.25, 0.8)
     tissue_roi: tuple[float, float] = (0.15, 0.45)
     flat_roi: float = 0.6
+    roi_margin: int = 0
 
     def __post_init__(self) -> None:
         if not _is_list(self.shape) or len(self.shape) != 3:
@@ -211,6 +219,7 @@ class DataConfig:
             ),
             scenes_kept=whole("scenes_kept", self.scenes_kept, high=_MOST),
             flat_roi=number("flat_roi", self.flat_roi, low=0.0, high=1.0),
+            roi_margin=whole("roi_margin", self.roi_margin, 0, _MOST_MARGIN),
         )
         for i, place in enumerate(self.situations):
             if math.hypot(place.x, place.y) >= place.patient_mm / 2.0:
@@ -234,7 +243,7 @@ class LateConfig:
     Args:
         begins: share of the steps after which they are drawn; 1 for never.
         scenes: changes of :class:`train.scenes.scene.SceneConfig`, instead of those of the data.
-        scenes_kept: different scenes, as of the data.
+        scenes_kept, roi_margin: as of the data.
 
     Raises:
         TypeError, ValueError: a value is out of its range, or ``scenes`` has an unknown key.
@@ -243,6 +252,7 @@ class LateConfig:
     begins: float = 1.0
     scenes: JsonObject = field(default_factory=dict)
     scenes_kept: int = 2000
+    roi_margin: int = 0
 
     def __post_init__(self) -> None:
         _section(SceneConfig, self.scenes, "scenes")
@@ -250,6 +260,7 @@ class LateConfig:
             self,
             begins=number("begins", self.begins, low=0.0, high=1.0),
             scenes_kept=whole("scenes_kept", self.scenes_kept, high=_MOST),
+            roi_margin=whole("roi_margin", self.roi_margin, 0, _MOST_MARGIN),
         )
 
 
@@ -456,7 +467,13 @@ class TrainConfig:
     @property
     def late_data(self) -> DataConfig:
         """What the training draws from then on."""
-        return replace(self.data, scenes=self.late.scenes, scenes_kept=self.late.scenes_kept)
+        late = self.late
+        return replace(
+            self.data,
+            scenes=late.scenes,
+            scenes_kept=late.scenes_kept,
+            roi_margin=late.roi_margin,
+        )
 
     @classmethod
     def from_yaml(cls, text: str) -> Self:

@@ -43,7 +43,7 @@ from torchpcct.files import atomic_write
 from torchpcct.geometry import VolumeGrid
 from torchpcct.scanner import presets
 from torchpcct.scene import Body, EllipticCylinder, Scene
-from train.config import DataConfig, Situation
+from train.config import OF_ROIS, DataConfig, Situation
 from train.scenes.drawing import draw_scene
 from train.scenes.rasterise import rasterise
 from train.scenes.scene import SceneConfig
@@ -68,6 +68,8 @@ FORMAT = "torchpcct training views 2"
 """What kept views say of themselves."""
 _REACH = 2
 """Voxels about one in which the truth is constant, or an edge."""
+_LEAST_VOXELS = 8
+"""Of a whole core, for its contrast."""
 _DRAWS_OF_ROI = 6
 """Random numbers that a small ROI takes."""
 _SIGNAL = 1
@@ -175,7 +177,8 @@ class Views:
     """
 
     def __init__(self, folder: Path, config: DataConfig, seed: int) -> None:
-        key = json.dumps({"format": FORMAT, "seed": seed, "data": asdict(config)}, sort_keys=True)
+        data = {k: v for k, v in asdict(config).items() if k not in OF_ROIS}
+        key = json.dumps({"format": FORMAT, "seed": seed, "data": data}, sort_keys=True)
         digest = hashlib.sha256(key.encode()).hexdigest()[:16]
         self.folder = folder / digest
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -392,6 +395,7 @@ class Data:
         problem = replace(empty, b=views[:, 3], scale=exposure).in_noise_units()
         problem = replace(problem, b=views[:, 3])
         signal, around = labels & _SIGNAL > 0, labels & _AROUND > 0
+        signal = _inner(signal, c.roi_margin)
         found = [
             _random_contrasts(signal, around, c, part)
             for part in random[:, 2:].split(_DRAWS_OF_ROI, 1)
@@ -531,6 +535,14 @@ def _size(mask: Tensor) -> Tensor:
     return mask.flatten(1).sum(1)
 
 
+def _inner(mask: Tensor, margin: int) -> Tensor:
+    """As much of the mask as lies ``margin`` voxels within it, or as deep as leaves enough."""
+    for _ in range(margin):
+        within = largest_nearby((~mask).float(), 1) == 0.0
+        mask = _chosen(_size(within) >= _LEAST_VOXELS, within, mask)
+    return mask
+
+
 def _contrasts(first: Tensor, second: Tensor, least: int) -> tuple[Tensor, Tensor]:
     """Mean over one mask less mean over the other, and the voxels of the smaller; 0 where one
     has too few."""
@@ -544,7 +556,7 @@ def _contrasts(first: Tensor, second: Tensor, least: int) -> tuple[Tensor, Tenso
 
 def _whole_contrasts(core: Tensor, tissue: Tensor) -> tuple[Tensor, Tensor]:
     """All of the core against all tissue in its slices."""
-    return _contrasts(core, tissue & core.any(3).any(2)[:, :, None, None], 8)
+    return _contrasts(core, tissue & core.any(3).any(2)[:, :, None, None], _LEAST_VOXELS)
 
 
 def _random_contrasts(

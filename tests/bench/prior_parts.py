@@ -22,6 +22,7 @@ from unittest import mock
 import torch
 from results import write_results
 from rival_scenes import DIRECTIONS, Bench, Place
+from scipy import ndimage
 from torch import Tensor
 
 from recon.mbir.known import KnownImage
@@ -103,23 +104,29 @@ def figures(network: Mbir, bench: Bench) -> dict[str, Any]:
         rows = []
         for with_core, without in pairs:
             clean = volume(dose * with_core.b, dose)
-            reading = partial(_contrast, with_core)
-            true = reading(without.true) - reading(with_core.true)
-            errors, contrasts, absent, flat = [], [], [], []
+            whole, middle = (
+                partial(_contrast, with_core, of) for of in (with_core.core, _inner(with_core.core))
+            )
+            errors, flat, contrasts, middles = [], [], [], []
             for k in range(FIRST_DRAW, FIRST_DRAW + DRAWS):
                 noise = bench.noise(dose, k)[1]
                 v, w = (volume(dose * p.b + noise, dose) for p in (with_core, without))
                 errors.append(_square(v - with_core.true, with_core))
-                contrasts.append(reading(v))
-                absent.append(reading(w))
+                contrasts.append((whole(v), whole(w)))
+                middles.append((middle(v), middle(w)))
                 flat.append(v[with_core.flat])
-            slope = (torch.tensor(contrasts) - torch.tensor(absent)).mean() / -true
+            slope, of_middle = (
+                float(-torch.tensor(read).diff(dim=1).mean())
+                / (of(with_core.true) - of(without.true))
+                for read, of in ((contrasts, whole), (middles, middle))
+            )
             row = {
                 "error": torch.tensor(errors).mean().sqrt(),
                 "clean": _square(clean - with_core.true, with_core) ** 0.5,
                 "fat": torch.stack(flat).var(0).mean().sqrt(),
                 "slope": slope,
-                "sd": torch.tensor(contrasts).std() / slope,
+                "middle": of_middle,
+                "sd": torch.tensor(contrasts)[:, 0].std() / slope,
                 "rim": clean[_rim(with_core)].min() - with_core.true.min(),
             }
             rows.append(row)
@@ -143,8 +150,13 @@ def _square(error: Tensor, place: Place) -> float:
     return float(error[place.inside].square().mean())
 
 
-def _contrast(place: Place, v: Tensor) -> float:
-    return float(v[place.around].double().mean() - v[place.core].double().mean())
+def _contrast(place: Place, of: Tensor, v: Tensor) -> float:
+    return float(v[place.around].double().mean() - v[of].double().mean())
+
+
+def _inner(core: Tensor) -> Tensor:
+    """Voxels of a core whose six neighbours are in it, too."""
+    return torch.from_numpy(ndimage.binary_erosion(core.numpy()))
 
 
 def _rim(place: Place) -> Tensor:
@@ -158,6 +170,7 @@ COLUMNS = (
     ("clean", "without noise"),
     ("fat", "SD in fat"),
     ("slope", "slope"),
+    ("middle", "slope, middle"),
     ("sd", "contrast SD at slope 1"),
     ("rim", "deepest undershoot"),
 )
@@ -171,7 +184,7 @@ def table(results: dict[str, Any]) -> str:
     ]
     for name, r in results.items():
         cells = [
-            " / ".join(f"{r[f'{d:g}'][k]:.{2 if k == 'slope' else 1}f}" for d in DOSES)
+            " / ".join(f"{r[f'{d:g}'][k]:.{2 if k in ('slope', 'middle') else 1}f}" for d in DOSES)
             for k, _ in COLUMNS
         ]
         lines.append(f"| {name} | " + " | ".join(cells) + f" | {r['moved_hu']:.1f} |")

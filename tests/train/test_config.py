@@ -90,6 +90,8 @@ def test_sections_from_plain_values():
         ("data: {situations: {x: 1, y: 2}}", "data: situations must be a list of places"),
         ("data: {situations: [{x: 420, y: 0}]}", r"situations\[0\]: x and y must be .* 120 mm"),
         ("data: {situations: [{x: true, y: 0}]}", r"situations\[0\]: x must be a number"),
+        ("data: {roi_margin: 9}", "data: roi_margin must be at most 8"),
+        ("late: {roi_margin: 0.5}", "late: roi_margin must be a whole number"),
         ("data: {scenes: {fat: 5}}", "data: scenes: fat must be 2 numbers, got 5"),
         ("data: {scenes: {fat: [5, 1]}}", "scenes: fat must be a range, the lower end first"),
         ("data: {scenes: {fat: [.nan, 1]}}", r"scenes: fat\[0\] must be finite"),

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 
 from recon.mbir.unrolled import first_views
 from train.config import DataConfig, Situation
@@ -129,6 +130,24 @@ def test_contrasts_are_differences_of_means(data):
             assert float(contrast.clamp_max(0).sum()) == pytest.approx(-1.0, abs=1e-4)
             assert float(voxels) == min(int((contrast > 0).sum()), int((contrast < 0).sum()))
     assert seen >= 6
+
+
+def test_contrasts_keep_away_from_borders_where_there_is_room(data, tmp_path):
+    """Of a whole core: what lies one voxel deep in it, all of it where less than eight would be
+    left."""
+    fine = replace(CONFIG, voxel_mm=0.2, shape=(24, 20, 20), scenes={"core_size": (0.5, 2.0)})
+    plain = Data(fine, 3, tmp_path)
+    inner = Data(replace(fine, roi_margin=1), 3, tmp_path)
+    assert inner.views.folder == plain.views.folder
+    kinds = set()
+    for step in range(6):
+        of = [d.batch(step, BATCH, range(4)).contrast[:, -1] for d in (plain, inner)]
+        for core, kept in zip(*((v > 0).numpy() for v in of), strict=True):
+            within = ndimage.binary_erosion(core, np.ones((3, 3, 3)), border_value=1)
+            room = within.sum() >= 8
+            kinds.add((bool(core.any()), bool(room)))
+            assert np.array_equal(kept, within if room else core)
+    assert {(True, True), (True, False)} <= kinds
 
 
 def test_exposures_lie_in_their_range(data):
