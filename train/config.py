@@ -37,7 +37,7 @@ LONGEST_INTERVAL = 120.0
 _MOST = 10**9
 """Steps, scenes and views at most: more are a slip of the pen."""
 _MOST_MARGIN = 8
-"""Voxels: no core is deeper."""
+"""Voxels: more would leave little of any core."""
 _HIGHEST = {"seed": 2**62, "unroll": 1000}
 """Other limits."""
 _MOST_VOXELS = 1024

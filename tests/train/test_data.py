@@ -132,7 +132,7 @@ def test_contrasts_are_differences_of_means(data):
     assert seen >= 6
 
 
-def test_contrasts_keep_away_from_borders_where_there_is_room(data, tmp_path):
+def test_contrasts_keep_away_from_borders_where_there_is_room(tmp_path):
     """Of a whole core: what lies one voxel deep in it, all of it where less than eight would be
     left."""
     fine = replace(CONFIG, voxel_mm=0.2, shape=(24, 20, 20), scenes={"core_size": (0.5, 2.0)})
