@@ -68,6 +68,9 @@ LEAST_MET = 0.5
 """Voxels that fewer rays meet are scaled as if it were this share, of the same mean weight: scaled
 by themselves, slices beyond the rows of a cone beam hang on the prior alone and spoil the condition
 number."""
+UNMET = 1e-3
+"""Voxels below this share are met by no ray: what a backprojector leaves there is rounding, of
+either sign."""
 SECTORS = 6
 """Sectors of ray directions with a D of their own, in a plane. Of 4 to 12, four took one pair in
 five more."""
@@ -124,7 +127,7 @@ class FieldModel:
         met = met / met[self.at]
         self.determined: Tensor = met >= DETERMINED
         unseen = LEAST_MET * self.seen[self.determined].median()
-        self.scale = torch.where(met > 0, self.seen * (LEAST_MET / met).clamp_min(1.0), unseen)
+        self.scale = torch.where(met > UNMET, self.seen * (LEAST_MET / met).clamp_min(1.0), unseen)
         self._ways = ray_azimuths(projector)
         self._projector, self._weights = projector, weights
         # One impulse after the other: a batch would need twice the memory.
